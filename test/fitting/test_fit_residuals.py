@@ -263,3 +263,17 @@ def test_bounds_hold(rng: np.random.Generator) -> None:
     assert (state.parameters >= limits[0]).all()
     assert (state.parameters <= limits[1]).all()
     assert np.isfinite(state.cost)
+
+
+def test_a_body_at_the_end_of_its_valley_takes_no_step(rng: np.random.Generator) -> None:
+    """What a step promises tells that it is not worth a look: the body stays as it is, to the bit."""
+    truth = random_body(rng, (0.4, 0.8))
+    rays = rays_to(truth.sample_surface(300, rng) + rng.normal(0, SIGMA, (300, 3)), pinhole=False)
+    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3])
+    there = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 100, 1e-12)
+    again = minimize(SAMPSON, rays, NO_RAYS, PLAIN, there, limits, 100, 1e-6)
+    assert again.iterations == there.iterations + 1
+    np.testing.assert_array_equal(again.parameters, there.parameters)
+    np.testing.assert_array_equal(again.rotation, there.rotation)
+    begun = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 100, 1e-6)
+    assert begun.cost == pytest.approx(there.cost, rel=1e-5)

@@ -366,6 +366,23 @@ def test_a_mask_tells_of_a_thing_where_nothing_was_measured(share):
     assert of_depth.size.max() < 0.08
 
 
+def test_a_network_that_predicts_bodies_is_asked_where_symmetry_leaves_more_than_noise(weights, monkeypatch):
+    """Of a clean image nothing is predicted; of one that no superquadric explains the bodies of all objects, once."""
+    camera = unit_cube.camera()
+    recoverer, asked = Recoverer(weights), []
+    network = recoverer._load_network(False)
+    predict = network.predict
+    monkeypatch.setattr(network, "predict", lambda views: asked.append(len(views)) or predict(views))
+    bodies = [Superquadric([0.12, 0.1, 0.09], [0.4, 0.7], [x, 0.5, 0.5], [0.3, 0.2, 0.1, 0.9]) for x in (0.27, 0.73)]
+    depth, labels = seen(bodies, camera)
+    depth = unit_cube.depth_from_grey(unit_cube.grey_from_depth(depth))
+    assert all(body.status == Status.CONVERGED for body in recoverer.recover(depth, camera, labels).bodies)
+    assert asked == []
+    folded = depth + np.where(np.arange(256) % 16 < 8, np.float32(0.03), np.float32(0))
+    recoverer.recover(folded, camera, labels)
+    assert asked == [2]
+
+
 def test_methods_do_what_they_say(weights):
     truth = random_bodies(1, 11)
     depth, labels = seen(truth, CAMERA, background=1.4)
