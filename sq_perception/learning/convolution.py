@@ -4,9 +4,10 @@ Normalisations are folded into the convolutions before them: with g, b, m, v of 
 
     w' = s w,   b' = b - s m,   s = g / sqrt(v + eps).
 
-Images lie channels last with a margin of zeros, in memory that is kept.  A convolution that halves the resolution is a
-product of matrices, its windows written side by side.  The others, 3 x 3, take Winograd's short way from tiles d of
-s x s pixels to tiles of s - 2 (Lavin and Gray, Fast algorithms for convolutional neural networks, 2016):
+Images lie channels last with a margin of zeros, in memory that is kept.  A convolution that halves the resolution, or
+of few channels, is a product of matrices, its windows written side by side.  The others, 3 x 3, take Winograd's short
+way from tiles d of s x s pixels to tiles of s - 2 (Lavin and Gray, Fast algorithms for convolutional neural networks,
+2016):
 
     A^T ((G w G^T) * (B^T d B)) A,    * the product of s^2 matrices (tiles, channels) (channels, channels)
 
@@ -18,7 +19,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,6 +34,8 @@ _G = {
     4: np.array([[2, 0, 0], [1, 1, 1], [1, -1, 1], [0, 0, 2]]) / 2,
     6: np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]]) / 24,
 }
+_FEW = 16
+"""Channels: up to here tiles take longer to write than products of matrices; views of 32 x 32 pixels take 0.4 of it."""
 _WIDE = 256
 """Channels: here tiles of 4 x 4 are taken, as to read matrices of those of 6 x 6 takes longer than they save."""
 _ZERO, _2, _4, _5, _8 = (np.float32(number) for number in (0, 2, 4, 5, 8))
@@ -94,11 +97,13 @@ class Direct:
             np.matmul(windows, self.matrix, out=rows)
         return out
 
-    def computed(self, x: np.ndarray, side: int, memory: Memory, name: str) -> np.ndarray:
-        """Framed images of ``side`` pixels a side."""
+    def computed(
+        self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
+    ) -> np.ndarray:
+        """Framed images of ``side`` pixels a side; ``skip``, images with that margin, is added to the sums."""
         products = self.products(x, 0, side, memory, "products")
         out = memory.framed(name, len(x), side, self.channels)
-        _write_sums(products, self.bias, side, out)
+        _write_sums(products, self.bias, out if skip is None else skip, skip is not None, margin, side, out)
         return out
 
 
@@ -122,7 +127,7 @@ class _Tiled:
     def computed(
         self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
     ) -> np.ndarray:
-        """Framed images of framed ones; ``skip``, images with that margin, is added to the sums."""
+        """As by :class:`Direct`."""
         squares, inputs, outputs = self.matrices.shape
         size = math.isqrt(squares)
         out = memory.framed(name, len(x), side, outputs)
@@ -143,16 +148,16 @@ class Block:
     """:class:`sq_perception.learning.backbone.ResidualBlock`; ``shortcut`` where it halves the resolution."""
 
     first: Direct | _Tiled
-    second: _Tiled
+    second: Direct | _Tiled
     shortcut: Direct | None
 
     @classmethod
     def folded(cls, weights: Weights, name: str) -> Block:
-        second = _Tiled.folded(weights, f"{name}.second", f"{name}.second_norm")
+        second = _kept(weights, f"{name}.second", f"{name}.second_norm")
         if f"{name}.shortcut.0.weight" not in weights:
-            return cls(_Tiled.folded(weights, f"{name}.first", f"{name}.first_norm"), second, None)
+            return cls(_kept(weights, f"{name}.first", f"{name}.first_norm"), second, None)
         shortcut = Direct.folded(weights, f"{name}.shortcut.0", f"{name}.shortcut.1", stride=2)
-        second = _Tiled(second.matrices, second.bias + shortcut.bias)
+        second = replace(second, bias=second.bias + shortcut.bias)
         return cls(Direct.folded(weights, f"{name}.first", f"{name}.first_norm", stride=2), second, shortcut)
 
     def computed(self, x: np.ndarray, side: int, memory: Memory, name: str) -> tuple[np.ndarray, int]:
@@ -164,6 +169,13 @@ class Block:
             skip = self.shortcut.products(x, 1, side, memory, "skip").reshape(len(x), side, side, -1)
         y = self.first.computed(x, side, memory, f"{name} first")
         return self.second.computed(y, side, memory, f"{name} second", skip, margin), side
+
+
+def _kept(weights: Weights, name: str, norm: str) -> Direct | _Tiled:
+    """A convolution that keeps the resolution."""
+    if weights[f"{name}.weight"].shape[1] <= _FEW:
+        return Direct.folded(weights, name, norm, stride=1)
+    return _Tiled.folded(weights, name, norm)
 
 
 def _parts(images: int, rows: int, columns: int) -> Iterator[slice]:
@@ -205,16 +217,41 @@ def _write_windows(x: np.ndarray, first: int, size: int, stride: int, side: int,
 
 
 @kernel
-def _write_sums(products: np.ndarray, bias: np.ndarray, side: int, out: np.ndarray) -> None:
-    """max(0, product + bias) into framed images."""
+def _write_sums(
+    products: np.ndarray,
+    bias: np.ndarray,
+    skip: np.ndarray,
+    is_added: bool,
+    margin: int,
+    side: int,
+    out: np.ndarray,
+) -> None:
+    """max(0, product + bias + skip) into framed images."""
     row = 0
     for image in range(out.shape[0]):
         for i in range(side):
             for j in range(side):
                 pixel, given = out[image, i + 1, j + 1], products[row]
-                for c in range(bias.shape[0]):
-                    pixel[c] = max(given[c] + bias[c], _ZERO)
+                if is_added:
+                    added = skip[image, i + margin, j + margin]
+                    for c in range(bias.shape[0]):
+                        pixel[c] = max(given[c] + bias[c] + added[c], _ZERO)
+                else:
+                    for c in range(bias.shape[0]):
+                        pixel[c] = max(given[c] + bias[c], _ZERO)
                 row += 1
+
+
+@kernel
+def write_doubled(coarse: np.ndarray, finer: np.ndarray, out: np.ndarray) -> None:
+    """Images (n, s, s, c), each pixel four times, and framed ones of twice the side: their sums into framed images."""
+    side = 2 * coarse.shape[1]
+    for image in range(coarse.shape[0]):
+        for i in range(side):
+            for j in range(side):
+                low, high, pixel = coarse[image, i // 2, j // 2], finer[image, i + 1, j + 1], out[image, i + 1, j + 1]
+                for c in range(low.shape[0]):
+                    pixel[c] = low[c] + high[c]
 
 
 @kernel

@@ -16,7 +16,7 @@ from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.geometry.threads import one_blas_thread
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import layout
-from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous
+from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous, write_doubled
 from sq_perception.learning.network_config import (
     BODY_OUTPUTS,
     LEAST_LOG,
@@ -164,10 +164,7 @@ def _raised(
     """Framed images of twice the side: those of single pixels by ``up``, doubled, added to ``finer``."""
     matrix, bias = up
     sums = memory.framed(f"raised to {2 * side}", len(x), 2 * side, len(bias))
-    more = (_inner(x, side) @ matrix + bias)[:, :, None, :, None]
-    shape = len(x), side, 2, side, 2, len(bias)
-    inner = _inner(sums, 2 * side)
-    inner[...] = _inner(finer, 2 * side) + np.broadcast_to(more, shape).reshape(inner.shape)
+    write_doubled(_inner(x, side) @ matrix + bias, finer, sums)
     return sums
 
 
