@@ -189,9 +189,9 @@ def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.nd
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement
     plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)
-    low, high = parameters.region[:3], parameters.region[3:]
-    wanted = np.all((bodies.translation >= low) & (bodies.translation <= high), axis=1)
-    wanted &= (parameters.only_id == -1) | (bodies.id == parameters.only_id)
+    wanted = (parameters.only_id == -1) | (bodies.id == parameters.only_id)
+    if (box := parameters.box) is not None:
+        wanted = wanted & np.all((bodies.translation >= box[:3]) & (bodies.translation <= box[3:]), axis=1)
     kept = tuple(grasp for grasp in plan.grasps if grasp.score >= parameters.min_score and wanted[grasp.body])
     have = {grasp.body for grasp in kept}
     reasons = tuple(

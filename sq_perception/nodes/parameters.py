@@ -269,9 +269,15 @@ class GraspParameters(Parameters):
     only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1))
     region: tuple[float, ...] = setting(
         EVERYWHERE,
-        "Plan for bodies whose centre is within least x, y, z and greatest x, y, z, in the frame of the cloud.",
+        "Plan for bodies whose centre is within least x, y, z and greatest x, y, z, in the frame of the cloud; the "
+        "default keeps all.",
         unit="m",
     )
+
+    @property
+    def box(self) -> Box | None:
+        """``region``; None for the default, which keeps all, however far away the origin of a map is."""
+        return None if self.region == GraspParameters.region else cast(Box, self.region)
 
     def __post_init__(self) -> None:
         super().__post_init__()

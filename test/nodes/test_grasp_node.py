@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -141,6 +142,13 @@ def test_a_region_may_be_asked_for_and_the_answer_has_its_grasps(bench):
     answer = bench.call(Trigger, "/grasp_node/plan")
     assert not answer.success
     assert answer.message == "0 grasps of 3 bodies; only_id and region leave none"
+
+
+def test_bodies_are_grasped_however_far_away_the_origin_of_a_map_is(bench):
+    """The numbers of the default region are no limit, as those of recover_node's workspace are none."""
+    there = replace(bodies(), translation=bodies().translation + [250.0, -400.0, 0.0])
+    heard = bench.answer(to_message(there, HEADER))
+    assert set(messages.from_message(heard["grasp_details"]).id) == {BOX, CAN}
 
 
 def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):
