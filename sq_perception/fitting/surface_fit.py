@@ -21,6 +21,7 @@ from typing import Literal
 import numpy as np
 
 from sq_perception.fitting import exact, starts, tolerant
+from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.hull_prior import HullPrior
@@ -49,6 +50,10 @@ _NOISE_ALONE = 1.06
 """Mean squared residual up to which a thing is taken for a superquadric.  19 in 20 superquadrics under independent
 noise left less.  Things that left more were worse by the exact course; of a time-of-flight camera, whose edges mix,
 nearly all do."""
+_AS_A_THING = 0.5
+"""Weight of the tolerant course's body beside an exact one: noise that a superquadric explains hides how a thing strays
+from one.  Chosen; of 217 things of benchmarks/household_things (60 scenes from seed 54200 on) under 10 mm of noise 11 %
+of the half sizes of converged bodies erred by more than three deviations, with it 3 %."""
 
 
 def fit(
@@ -117,7 +122,8 @@ def fit(
     solution = course.solve(Problem.of(observation, options, began), given)
     untried = options.plane is None or not fine
     if is_thing and untried and _is_explained(solution, crop.noise.sigma):
-        solution = _as_thing(_exactly(crop, options, [solution.state, *given], None, began)) or solution
+        exactly = _as_thing(_exactly(crop, options, [solution.state, *given], None, began))
+        solution = solution if exactly is None else _or_else(exactly, solution.state)
     return assessed(solution, began)
 
 
@@ -133,6 +139,11 @@ def _as_thing(exactly: Solution | None) -> Solution | None:
     if exactly is None or exactly.state.cost >= _NOISE_ALONE * exactly.rays.weight:
         return None
     return replace(exactly, spread_factor=tolerant.SPREAD)
+
+
+def _or_else(exactly: Solution, thing: State) -> Solution:
+    """The same, with what the tolerant course makes of it as another body that the image allows."""
+    return replace(exactly, alternatives=(*exactly.alternatives, Alternative(thing, _AS_A_THING)))
 
 
 def _exactly(
