@@ -97,6 +97,10 @@ class Input:
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=_INFOS)
+        self._image_stamp = -1
+        """Of the last image."""
+        self._are_paired = False
+        """Whether an image has had a camera_info of its own stamp."""
         self._masks: OrderedDict[int, Image] = OrderedDict()
         self._is_closed = False
         # Of a subscription that another thread destroys meanwhile not even the name can be asked.
@@ -226,6 +230,8 @@ class Input:
             if self._is_closed:
                 self._statistics.count("dropped")
                 return
+            self._image_stamp = stamp_of(message)
+            self._are_paired |= any(info.stamp == self._image_stamp for info in self._infos)
             self._waiting.append(Arrival(message, size, now, deadline, needs_mask))
             self._promote(now)
 
@@ -243,6 +249,7 @@ class Input:
             fault = str(error)
         with self._changed:
             self._infos.append(_Info(stamp_of(message), size, calibration, fault))
+            self._are_paired |= stamp_of(message) == self._image_stamp
             self._promote(monotonic())
 
     def _on_mask(self, message: Image) -> None:
@@ -274,8 +281,19 @@ class Input:
         if arrival.size is None:
             return True
         stamp = stamp_of(arrival.message)
-        has_info = self._info is None or self._info_for(arrival.size, stamp) is not None
+        has_info = self._info is None or self._knows_camera(arrival.size, stamp)
         return has_info and (not arrival.needs_mask or stamp in self._masks)
+
+    def _knows_camera(self, size: tuple[int, int], stamp: int) -> bool:
+        """Whether the camera_info of an image has come, or will say what those before it do.
+
+        Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
+        another one's would shift every body.
+        """
+        fitting = [info for info in self._infos if info.size == size]
+        if not fitting or any(info.stamp == stamp for info in fitting):
+            return bool(fitting)
+        return not self._are_paired or all(info.calibration == fitting[0].calibration for info in fitting)
 
     def _info_for(self, size: tuple[int, int], stamp: int) -> _Info | None:
         fitting = [info for info in self._infos if info.size == size]

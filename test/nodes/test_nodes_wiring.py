@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
@@ -124,6 +125,33 @@ def test_a_camera_info_that_comes_after_its_image_is_waited_for(make_bench):
     bench.send_info()
     bench.until(lambda: bench.counts.answered == 1)
     assert bench.counts.refused == 0
+
+
+def test_a_camera_info_that_changes_is_waited_for(make_bench):
+    """As with a region of interest that moves: a driver publishes it after its image, and another one's shifts it."""
+    bench = make_bench("-p", "patience:=10.0")
+    for left in range(4):
+        image, camera = bench.depth(), Camera(64, 48, 60.0, 60.0, 31.5 - 4 * left, 23.5)
+        info = bench.info(camera)
+        info.header.stamp = image.header.stamp
+        before = bench.counts.received
+        bench.images.publish(image)
+        bench.until(lambda before=before: bench.counts.received > before)
+        time.sleep(0.02)  # in which an image that waits for nothing is taken
+        bench.put_info(info)
+        bench.until(lambda: bench.counts.in_work == 0)
+        if left != 1:  # the first change that there was could not be expected
+            assert bench.recoverer.asked[-1][1] == camera
+
+
+def test_a_camera_info_that_changed_without_the_stamps_of_images_is_not_waited_for(make_bench):
+    bench = make_bench("-p", "patience:=10.0")
+    for left in (0, 4):
+        bench.send_info(camera := Camera(64, 48, 60.0, 60.0, 31.5 - left, 23.5))
+    began = time.monotonic()
+    bench.answer(bench.depth())
+    assert bench.recoverer.asked[-1][1] == camera
+    assert time.monotonic() - began < 5.0
 
 
 def test_the_newest_frame_wins_and_every_frame_is_accounted_for(bench):
