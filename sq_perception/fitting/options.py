@@ -44,8 +44,8 @@ class FitOptions:
         Standard deviation of the depth noise, metres; None estimates it from the image.
     model_error
         How far the object may stray from a superquadric, metres.  None: 0 if a superquadric explains the image down
-        to its noise, else 2.5 mm for objects on a plane or with a predicted hull, less for those of which less than
-        6 cm are seen, what is left over for others.
+        to its noise, else 2.5 mm for objects on a plane, with a predicted hull, or that one all but explains, less for
+        those of which less than 6 cm are seen, what is left over for others.
     plane
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.

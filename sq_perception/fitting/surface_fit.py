@@ -101,9 +101,11 @@ def fit(
     undecided = options.model_error is None
     model_error = min(MODEL_ERROR, _MODEL_SHARE * crop.footprint * math.sqrt(np.count_nonzero(crop.mask)))
     fine = crop.noise.sigma < _FINE_NOISE * model_error
+    # Who calls may know no plane and no hull, and what a camera measured is mostly a thing all the same.
+    is_doubtful = camera.is_pinhole and not fine and not _fills(mask, depth)
     if undecided and (later is not None if options.plane is None else fine):
         exactly = _exactly(crop, options, given, later, began)
-        if exactly is not None and not (camera.is_pinhole and _is_thing(mask, depth, options)):
+        if exactly is not None and not (is_doubtful or (camera.is_pinhole and _is_thing(mask, depth, options))):
             return assessed(exactly, began)
         if (thing := _as_thing(exactly)) is not None:
             return assessed(thing, began)
@@ -120,6 +122,8 @@ def fit(
     course = tolerant if options.model_error else exact
     given = given if later is None else later()
     solution = course.solve(Problem.of(observation, options, began), given)
+    if undecided and course is exact and is_doubtful:
+        solution = _as_thing(solution) or _strayed(crop, replace(options, model_error=model_error), solution, given)
     untried = options.plane is None or not fine
     if is_thing and untried and _is_explained(solution, crop.noise.sigma):
         exactly = _as_thing(_exactly(crop, options, [solution.state, *given], None, began))
@@ -131,7 +135,22 @@ def _is_thing(mask: np.ndarray, depth: np.ndarray, options: FitOptions) -> bool:
     """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
     if options.plane is not None:
         return True
-    return not fills(box(mask), np.isfinite(depth) & (depth > 0)) and options.predicted_hull() is not None
+    return not _fills(mask, depth) and options.predicted_hull() is not None
+
+
+def _fills(mask: np.ndarray, depth: np.ndarray) -> bool:
+    """Whether the object fills what was measured, as the unit cube's bodies and walls before a camera do."""
+    return fills(box(mask), np.isfinite(depth) & (depth > 0))
+
+
+def _strayed(crop: Crop, options: FitOptions, exactly: Solution, given: list[State]) -> Solution:
+    """What the tolerant course makes of an object of which the exact one left more than the noise."""
+    problem = exactly.problem
+    if exactly.spread_factor > 1 or problem.late:  # it is of that course already
+        return replace(exactly, spread_factor=tolerant.SPREAD)
+    observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
+    strayed = replace(Problem.of(observation, options, 0.0), deadline=problem.deadline)
+    return tolerant.solve(strayed, [exactly.state, *given])
 
 
 def _as_thing(exactly: Solution | None) -> Solution | None:
