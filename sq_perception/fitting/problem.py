@@ -211,6 +211,8 @@ class Solution:
         Of the covariance, where residuals err alike.
     as_hull
         Whether it resembles the convex hull of the object only.
+    is_unfinished
+        Whether time was up before the search came near the noise, so that nobody knows how far off the body is.
     """
 
     problem: Problem
@@ -220,6 +222,7 @@ class Solution:
     notes: tuple[str, ...] = ()
     spread_factor: float = 1.0
     as_hull: bool = False
+    is_unfinished: bool = False
 
     @cached_property
     def distances(self) -> np.ndarray:

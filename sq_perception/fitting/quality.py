@@ -21,6 +21,7 @@ _ENCLOSED_SHARE = 1.0
 """Of the middle half size: a body that encloses a thing but for a trigger, a spout or a rim is one that a planner can
 use with care.  Of 3582 things of benchmarks/household_things ten well measured ones left more than the smallest half
 size of their hull: seven of them less than this, of IoU 0.33 to 0.80, and three more, of 0.24 to 0.43."""
+_UNFINISHED = "how far it is off is not known"
 _AXES = "xyz"
 
 
@@ -31,12 +32,16 @@ def assessed(solution: Solution, began: float) -> Fit:
     covariance = solution.covariance + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
+    if solution.is_unfinished:  # it is that of the lowest point of a valley, where the body is not
+        covariance = np.full_like(covariance, np.nan)
     typical = quantile(np.abs(solution.distances), 0.5)
     residual, inlier_share = _within(solution.distances, INLIER * observation.sigma, INLIER * typical)
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         typical = quantile(np.maximum(solution.distances, 0.0), _REACHED)
     reached, message = status(canonical, covariance, typical, observation.sigma, solution.as_hull)
+    if solution.is_unfinished and reached == Status.CONVERGED:
+        reached, message = Status.WEAK, _UNFINISHED
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(
         superquadric=canonical,

@@ -82,7 +82,7 @@ def fit(
     -------
     Fit
         Hard images give status FAILED with a best-effort box.  The body is always finite; the covariance of a failed
-        fit may be NaN.
+        fit, and of one that time ended far above the noise, may be NaN.
 
     Raises
     ------
