@@ -146,8 +146,9 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
         solution = unseen.with_open_ends(solution)
     if not problem.late:
         solution = unseen.weighed(solution)
-    cost = solution.state.cost / solution.rays.weight
-    return replace(solution, is_unfinished=problem.late and cost > _UNFINISHED)
+    if problem.late and solution.state.cost > _UNFINISHED * solution.rays.weight:
+        solution = replace(solution, is_unfinished=True)
+    return solution
 
 
 def _enough_rays(observation: Observation) -> int:
