@@ -8,7 +8,9 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
               below ``_SURE``, the network is asked about that piece as if it were a segment, and then about pieces
               that no object claims.  A piece shows another object if it claims itself, and if it and the objects
               found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the object
-              that claims it most
+              that claims it most.  Parts that go on behind something nearer, as lines of sight tell
+              (:mod:`sq_perception.segmentation.convex_parts`), stay one: the two ends of a box behind a post look like
+              two things
     joined    a and b are one if each is the other's object: if the smaller of the means of p_a over b and of p_b over a
               is more than ``_ONE``; the surest pairs first, until there is none
     strays    pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
@@ -35,7 +37,7 @@ from sq_perception.imaging import canonical_view, depth_steps, regions, segment_
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.segmentation import pieces, segments
+from sq_perception.segmentation import convex_parts, pieces, segments
 from sq_perception.segmentation.segments import Segmentation
 
 _ONE = 0.45
@@ -120,7 +122,7 @@ class SegmentNetwork:
             return found
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
-        parts = self._parted(labels, seen)
+        parts = self._parted(labels, seen, found.sigma)
         if parts:
             seen |= self._seen(labels, parts)
         for _ in range(_ROUNDS if len(seen) > 1 else 0):
@@ -159,14 +161,38 @@ class SegmentNetwork:
                 strays[answer.window] |= _strays(own, *_shown(asked, label, answer))
         return found
 
-    def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
-        """Part segments that are several objects; the labels of all the parts."""
+    def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen], sigma: float) -> list[int]:
+        """Part segments that are several objects; the labels of all the parts.
+
+        ``sigma`` is the noise of the depth at one metre.
+        """
         doubts = {label: doubt for label, answer in seen.items() if (doubt := _doubt(answer)) is not None}
         if not doubts:
             return []
         objects = self.mapped(lambda some: self._objects([doubts[label] for label in some]), list(doubts))
-        parts = [_cut(labels, label, seen[label], each) for label, each in zip(doubts, objects, strict=True)]
-        return [label for some in parts for label in some]
+        parts: list[int] = []
+        for label, each in zip(doubts, objects, strict=True):
+            parts += self._one_behind(labels, _cut(labels, label, seen[label], each), sigma)
+        return parts
+
+    def _one_behind(self, labels: np.ndarray, parts: Sequence[int], sigma: float) -> list[int]:
+        """Join parts of a segment that go on behind something nearer, in ``labels``; those that there are then.
+
+        None where the segment is whole again: the network has seen it.  Of 64 segments of 500 simulated scenes that it
+        would part 22 show one thing; this leaves 10 of them whole, and 1 of the 42 that show two.
+        """
+        if not parts:
+            return []
+        name = {part: part for part in parts}
+        depth = np.where(np.isfinite(self.depth), self.depth, np.float32(0))
+        for pair in convex_parts.continued(labels, parts, depth, self.camera, sigma):
+            first, second = sorted(name[part] for part in pair)  # the segment's own name is the least
+            name = {part: first if now == second else now for part, now in name.items()}
+        for part, now in name.items():
+            if now != part:
+                labels[labels == part] = now
+        remain = list(dict.fromkeys(name.values()))
+        return remain if len(remain) > 1 else []
 
     def _objects(self, doubts: Sequence[_Doubt]) -> list[list[np.ndarray]]:
         """Of each segment, the logits (p, p) of the objects that pieces of it show, in the cells of its view.

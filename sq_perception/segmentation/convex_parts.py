@@ -29,7 +29,7 @@ Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-o
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -105,6 +105,20 @@ def corrected(
     return regions.renumbered(image.labels, number_of)
 
 
+def continued(
+    labels: np.ndarray, names: Sequence[int], depth: np.ndarray, camera: Camera, sigma: float
+) -> list[tuple[int, int]]:
+    """Pairs of some segments, by their labels, that go on behind something nearer, as step 4 has it.
+
+    Images as for :func:`corrected`.
+    """
+    image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), labels, camera, sigma)
+    extents = regions.extents(labels)
+    parts = [part for name in names if (part := image.sampled(name, extents[name], FEW)) is not None]
+    pairs = np.argwhere(_go_on(image, parts, np.ones((len(parts), len(parts)), bool)))
+    return [(parts[a].label, parts[b].label) for a, b in pairs if a < b]
+
+
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by parting and joining two balls."""
     camera = Camera(64, 48, 120.0, 120.0, 31.5, 23.5)
@@ -172,8 +186,7 @@ def _crossed_between(
     """Of each two segments the share (n, n) of crossed lines, 0 if they go on behind something nearer or are of one
     vessel, inf if they are neither near nor that, or no thing together."""
     names = np.array([part.label for part in parts])
-    pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
-    ends = np.cumsum([0] + [len(part.z) for part in parts])
+    pixels, points, ends = _together(parts)
     borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)
     met, beside, behind = (each[np.ix_(names, names)] for each in borders)
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
@@ -182,8 +195,7 @@ def _crossed_between(
     is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
     far = np.isinf(crossed) & ~(is_bit[:, None] & is_bit)
-    along, over = crossings.hidden(pixels, points, ends, names, far, image.depth, image.labels, *image.limits)
-    crossed[far & (along > _ALONG) & (over < AS_ONE)] = 0.0
+    crossed[_go_on(image, parts, far)] = 0.0
     for inside, wall in insides:
         before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
         vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
@@ -195,3 +207,18 @@ def _crossed_between(
     is_enclosed = regions.enclosed(borders[0])[names]
     crossed[(is_enclosed[:, None] | is_enclosed) & (met == 0)] = np.inf
     return crossed
+
+
+def _go_on(image: SampledImage, parts: list[Samples], wanted: np.ndarray) -> np.ndarray:
+    """Which of ``wanted`` pairs of segments, bool (n, n), go on behind something nearer."""
+    if not wanted.any():
+        return wanted
+    names = np.array([part.label for part in parts])
+    along, over = crossings.hidden(*_together(parts), names, wanted, image.depth, image.labels, *image.limits)
+    return np.asarray(wanted & (along > _ALONG) & (over < AS_ONE))
+
+
+def _together(parts: list[Samples]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels and points of the samples of all segments, and where those of each end."""
+    pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
+    return pixels, points, np.cumsum([0] + [len(part.z) for part in parts])

@@ -142,6 +142,25 @@ def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
     assert abs(len(first) - len(second)) < 0.2 * len(first)
 
 
+@pytest.mark.parametrize(("before", "parts"), [(0.1, 1), (-0.1, 2)])
+def test_the_ends_of_a_box_behind_a_post_stay_one_whatever_the_network_says(before: float, parts: int) -> None:
+    """It doubts the box, and takes its halves for two things; so they are where what is between them is farther."""
+    depth, truth = seen([TABLE.body(0, 0, (0.1, 0.03, 0.05), (0.1, 0.1))])
+    post = np.abs(np.arange(CAMERA.width) - np.median(np.nonzero(truth)[1])) < 10
+    labels = np.where(post, 2, 1) * truth
+    depth = np.where(labels == 2, depth - before, depth).astype(np.float32)
+
+    def doubts_the_box(views: np.ndarray) -> np.ndarray:
+        if network.asked > 2:  # pieces of the box
+            return claims_of_halves(views)
+        return np.where(views[..., segment_view.SEGMENT] > 0, np.array([0.4, 3.0])[:, None, None], -3.0)
+
+    network = GivenLogits(doubts_the_box)
+    found = of(network, depth).improved(segmentation(labels))
+    assert len(np.unique(found.labels[labels == 1])) == parts
+    assert len(found.ids) == parts + 1
+
+
 def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     """The network sees an object in the right half, and none in the left one, as where a sensor smeared an edge."""
 

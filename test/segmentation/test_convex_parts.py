@@ -170,6 +170,18 @@ def test_a_board_goes_on_behind_what_is_nearer():
     assert len(set(of_parts(*behind_a_post(between=0.9)))) == 3, "the gap shows what lies behind"
 
 
+def test_two_parts_of_a_board_go_on_behind_a_post_and_the_post_does_not():
+    def pairs(depth, labels):
+        return convex_parts.continued(labels, names(labels), depth, CAMERA, NOISE)
+
+    assert pairs(*behind_a_post()) == [(1, 2)]
+    assert not pairs(*behind_a_post(tilt=0.5)), "they are two faces"
+    assert not pairs(*behind_a_post(between=0.9)), "the gap shows what lies behind"
+    depth, labels = behind_a_post()
+    assert not convex_parts.continued(labels, [], depth, CAMERA, NOISE)
+    assert not convex_parts.continued(labels, [3], depth, CAMERA, NOISE)
+
+
 def pot(deep, scale=1.0):
     """A front wall with an inside a step behind it, below whose bottom something else is seen."""
     v, u = np.indices((CAMERA.height, CAMERA.width))
