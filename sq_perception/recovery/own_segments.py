@@ -63,9 +63,10 @@ _MOST_STRAYS = 0.5
 segment keeps its pixels, if it is not dropped."""
 _ROUNDS = 3
 """Of joining: eight pieces may become one."""
-_ITSELF_AFTER_ALL = 0.6
+_ITSELF_AFTER_ALL = 0.75
 """The same of what was disowned before.  Of 2507 simulated things on tables, in rooms, furniture and crowds 226 are
-missed without a second look and 216 with it, and 204 and 209 segments are none of a thing."""
+missed without a second look and 216 with it, and 204 and 209 segments are none of a thing.  53 pieces that it found to
+be things, in 2600 other scenes, all claim more than this, of 12 that were none 4 claim less."""
 _BRUSH = np.ones((7, 7), np.uint8)
 """Pixels; what is left along edges is thinner.  With 3 x 3 212 of them are missed, and on 14 recorded frames a second
 look adds 6 bodies of nothing to the 30 that there are without; with this 1."""
