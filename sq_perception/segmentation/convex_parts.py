@@ -115,7 +115,10 @@ def continued(
     image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), labels, camera, sigma)
     extents = regions.extents(labels)
     parts = [part for name in names if (part := image.sampled(name, extents[name], FEW)) is not None]
-    pairs = np.argwhere(_go_on(image, parts, np.ones((len(parts), len(parts)), bool)))
+    if len(parts) < 2:
+        return []
+    sampled = np.array([part.label for part in parts])
+    pairs = np.argwhere(_go_on(image, sampled, _together(parts), np.ones((len(parts), len(parts)), bool)))
     return [(parts[a].label, parts[b].label) for a, b in pairs if a < b]
 
 
@@ -186,7 +189,7 @@ def _crossed_between(
     """Of each two segments the share (n, n) of crossed lines, 0 if they go on behind something nearer or are of one
     vessel, inf if they are neither near nor that, or no thing together."""
     names = np.array([part.label for part in parts])
-    pixels, points, ends = _together(parts)
+    together = pixels, points, ends = _together(parts)
     borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)
     met, beside, behind = (each[np.ix_(names, names)] for each in borders)
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
@@ -195,7 +198,7 @@ def _crossed_between(
     is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
     far = np.isinf(crossed) & ~(is_bit[:, None] & is_bit)
-    crossed[_go_on(image, parts, far)] = 0.0
+    crossed[_go_on(image, names, together, far)] = 0.0
     for inside, wall in insides:
         before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
         vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
@@ -209,12 +212,12 @@ def _crossed_between(
     return crossed
 
 
-def _go_on(image: SampledImage, parts: list[Samples], wanted: np.ndarray) -> np.ndarray:
-    """Which of ``wanted`` pairs of segments, bool (n, n), go on behind something nearer."""
-    if not wanted.any():
-        return wanted
-    names = np.array([part.label for part in parts])
-    along, over = crossings.hidden(*_together(parts), names, wanted, image.depth, image.labels, *image.limits)
+def _go_on(
+    image: SampledImage, names: np.ndarray, together: tuple[np.ndarray, np.ndarray, np.ndarray], wanted: np.ndarray
+) -> np.ndarray:
+    """Which of ``wanted`` pairs of segments, bool (n, n), go on behind something nearer; of their labels (n,), and
+    samples as by :func:`_together`."""
+    along, over = crossings.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
     return np.asarray(wanted & (along > _ALONG) & (over < AS_ONE))
 
 
