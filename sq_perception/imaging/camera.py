@@ -152,7 +152,7 @@ class Camera:
         """Raise ValueError unless the image has this camera's size."""
         if image.ndim != 2:
             raise ValueError(f"expected an image (height, width), got an array of shape {image.shape}")
-        if image.shape[:2] != (self.height, self.width):
+        if image.shape != (self.height, self.width):
             raise ValueError(
                 f"image of {image.shape[1]} x {image.shape[0]} pixels does not fit a camera of "
                 f"{self.width} x {self.height}"

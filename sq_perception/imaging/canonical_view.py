@@ -45,7 +45,9 @@ COVERED = -1.5
 """Value of a pixel of the object's mask at which nothing was measured, in views that show steps."""
 
 NEAREST = 0.5 * (1 + 1 / MARGIN)
+"""z0: the value of the object's nearest point."""
 OUTLIERS_PER_END = 1 / 500
+"""Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
 _SURROUNDINGS = 1.2
 """More than MARGIN: under perspective the view's edges are not where those of the silhouette's box are."""
 _NEARER = 0.04
@@ -324,10 +326,11 @@ def _nearer(
     plane: np.ndarray,
     tolerance: float,
 ) -> np.ndarray:
-    """How much nearer (height, width) what was measured beside the object is than it, ``filled``; metres.
+    """How much nearer than the object, metres, the reading at each pixel (height, width) beside it is.
 
-    At those of the pixels ``lost`` where nothing was measured +inf within the mask, else NaN; -inf at others without a
-    reading, and at those of the object and of the plane.
+    The object's own depth beside its mask is that of its nearest pixel, in ``filled``.  -inf at pixels of the object
+    and of the plane.  Where nothing was measured: +inf within the mask and NaN beyond it at the pixels set in ``lost``,
+    -inf at the others.
     """
     nearer = np.full(depth.shape, np.float32(-np.inf))
     for v in range(depth.shape[0]):
@@ -356,14 +359,13 @@ def _resampled(
     z_guess: float,
     pixels: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values (pixels, pixels) of a view, and how much nearer what is beside is, in its sides.
-
-    By the nearest pixel of a crop of the image (height, width).
+    """``image`` and ``beside`` (pixels, pixels) of a view, each from the nearest pixel of a crop (height, width).
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
     of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
     Guesses that fall beside the object go on with the z of its nearest pixel, which ``filled`` (turned z) holds.
-    The object may go on beyond ``whole``: left, top, right and bottom of the image, unless it is empty.
+    ``whole`` is left, top, right and bottom of the whole image in the crop: beyond it the object may go on.  Where it
+    is empty, that is not asked.
     """
     fx, fy, cx, cy, pinhole = lens
     height, width = image.shape

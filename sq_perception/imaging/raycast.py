@@ -54,10 +54,11 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
 
 
 def windows(corners: np.ndarray, camera: Camera) -> np.ndarray:
-    """Pixels int64 (n, 4): left, top, right, bottom, the last two exclusive, beside which nothing of things is seen.
+    """The part of the image that each of n things can be seen in: int64 (n, 4), left, top, right and bottom pixel, the
+    last two exclusive.
 
-    Each is within the hull of its corners (n, k, 3); one that reaches behind a pinhole camera may be seen anywhere, one
-    that is behind it nowhere.
+    A thing lies within the convex hull of its ``corners`` (n, k, 3).  One that reaches behind a pinhole camera may be
+    seen anywhere in the image, one that is wholly behind it nowhere.
     """
     pixels, size = camera.project(corners), np.array([camera.width, camera.height])
     first, last = np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1

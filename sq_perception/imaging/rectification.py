@@ -36,7 +36,7 @@ import cv2
 import numpy as np
 
 from sq_perception.files.unpacking import MOST_PIXELS
-from sq_perception.imaging import perforation
+from sq_perception.imaging import depth_steps, perforation
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 
@@ -53,7 +53,6 @@ _STEEPEST = 10.0
 _CLOSE = 0.01
 """Pixels between two places that are as good as one."""
 _SQUARE = np.ones((2, 2), np.uint8)
-_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _OUTSIDE = -9.0
 """A column and row that no image has."""
 
@@ -167,7 +166,7 @@ class Lookup:
         with np.errstate(divide="ignore", invalid="ignore"):
             bridged, _, _ = perforation.filled(image)
             inverse = cv2.patchNaNs(1 / bridged, 0)
-            closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, _CROSS)
+            closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, depth_steps.CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
             # Of each pixel and its neighbours to the right, below, and across.
             least, most = (find(inverse, _SQUARE, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))

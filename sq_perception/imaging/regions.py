@@ -7,6 +7,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps
+from sq_perception.imaging.camera import Camera
 
 _OPEN = 0.1
 """Share of a region's border from which on it is not enclosed by others."""
@@ -16,7 +17,10 @@ to measure.  That of a D435 takes so much of what is 0.25 m away.  Chosen."""
 
 
 def nearest(wanted: np.ndarray) -> np.ndarray:
-    """Of each pixel (height, width) the nearest one of some, bool, at least one: its index into the flat image."""
+    """For each pixel (height, width), the index into the flat image of the nearest pixel that is set in ``wanted``.
+
+    ``wanted`` is bool (height, width), with at least one pixel set.
+    """
     away = (~wanted).view(np.uint8)
     _, number = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     index = np.zeros(int(number.max()) + 1, np.int64)
@@ -33,8 +37,10 @@ def convex_hull(mask: np.ndarray) -> np.ndarray:
 
 
 def extents(labels: np.ndarray) -> np.ndarray:
-    """Of each label (count + 1, 5): how many pixels it has, its first row, the one after its last, and its columns
-    alike.  All 0 for a label without pixels and for 0."""
+    """Size and bounding box of each label, int64 (count + 1, 5); all 0 for label 0 and for labels without pixels.
+
+    In this order: number of pixels, first row, last row + 1, first column, last column + 1.
+    """
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     return np.asarray(_extents(labels, int(labels.max(initial=0))))
 
@@ -43,6 +49,20 @@ def pixels(labels: np.ndarray, label: int, extent: np.ndarray) -> tuple[np.ndarr
     """Rows and columns of a label's pixels, by its extent."""
     rows, columns = _pixels(np.ascontiguousarray(labels, dtype=np.int32), int(label), *extent.tolist())
     return rows, columns
+
+
+def window(extent: np.ndarray, margin: int = 0) -> tuple[slice, slice]:
+    """The rows and columns of an image that a label's box takes, by its extent, and a margin around it."""
+    _, top, bottom, left, right = extent.tolist()
+    return slice(max(top - margin, 0), bottom + margin), slice(max(left - margin, 0), right + margin)
+
+
+def some_points(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, camera: Camera, count: int) -> np.ndarray:
+    """Points (k, 3) that pixels (n,) with these depths (height, width) see: every m-th one, so that ``count`` are left
+    at least, or all."""
+    step = max(1, rows.size // count)
+    rows, columns = rows[::step], columns[::step]
+    return camera.unproject(columns, rows, depth[rows, columns])
 
 
 def box(mask: np.ndarray) -> tuple[int, int, int, int]:
