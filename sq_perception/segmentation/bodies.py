@@ -1,6 +1,7 @@
-"""Bodies of the pixels that are above a support, or of all there are: components, parted and joined, and their feet.
+"""Bodies among the pixels that are above a support, or among all pixels where there is no support.
 
-Steps 2 to 4 of :mod:`sq_perception.segmentation.segments`.  Metres and pixels.
+Steps 2 to 4 of :mod:`sq_perception.segmentation.segments`: components that no depth step cuts; these taken apart and
+joined; and each body continued down to its foot.  Metres and pixels.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_parts, standing, support_plane, support_surface
+from sq_perception.segmentation import convex_parts, standing, support_surface
 from sq_perception.segmentation.support_surface import SupportSurface
 
 LEAST_SIGMA = 5e-4
@@ -37,17 +38,20 @@ beyond which it is noise: of independent noise most do, of a side seen at a graz
 
 
 def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support: SupportSurface) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of what is above the support; heights are 0 where depths are."""
+    """Bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
+
+    ``relative`` are heights (height, width) above the support, metres at one metre of depth, 0 where there is no depth;
+    ``valid`` is where bodies are looked for.
+    """
     known, camera = seen.known, seen.camera
     labels = np.zeros(known.shape, np.int32)
-    # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
-    clear = cv2.blur(relative, (3, 3)) > max(0.5 * support_plane.TOLERANCE, 4 * support.sigma)
+    clear = cv2.blur(relative, (3, 3)) > support.clear_height
     # The mean beside a tall body is that of its height: the pixel itself decides there.
-    above = relative > max(0.25 * support_plane.TOLERANCE, 2 * support.sigma)
-    above &= ~support_surface.risen(relative, known, valid, camera)
-    clear &= above
+    raised = relative > 0.5 * support.clear_height
+    raised &= ~support_surface.risen(relative, known, valid, camera)
+    clear &= raised
     clear &= ~standing.furniture(seen, clear)
-    left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
+    left, top, width, height = regions.box(clear)
     if width == 0:
         return labels
     reach = _FOOT_PIXELS + 1
@@ -58,7 +62,7 @@ def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support:
     camera = camera.cropped(left, top, known.shape[1], known.shape[0])
     holds = partial(seen.options.is_small, up=support.plane.equation[:3])
     inside = taken_apart(known, clear, camera, support.sigma, holds)
-    foot = above[window] & (inside == 0)
+    foot = raised[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
 

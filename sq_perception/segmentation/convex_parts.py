@@ -132,21 +132,25 @@ def warm_up() -> None:
 
 
 def _rims(image: SampledImage) -> np.ndarray:
-    """Labels (n, 2) of two segments, the first a step behind the second along a large share of both borders."""
+    """Pairs (n, 2) of labels of which the first lies a depth step behind the second along a large share of the borders
+    of both."""
     met, _, behind = regions.borders(image.labels, image.depth, int(image.labels.max()), _NEAR, _HOLLOW_DEPTH)
     border = met.sum(axis=1)
     return np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :]))
 
 
 def _insides(image: SampledImage, rims: np.ndarray, parts: list[Samples], origin: list[int]) -> list[tuple[int, int]]:
-    """Those of such pairs that are the inside of a vessel, which has no convex pieces, and what its wall is of."""
+    """Those pairs of :func:`_rims`, an inside and its wall, of which the first is the inside of a vessel.
+
+    The inside of a vessel is a segment that was not parted and whose surface lies behind its own lines.
+    """
     whole = [part for part in parts if part.label in rims[:, 0] and origin.count(part.label) == 1]
     hollow = [part.label for part in whole if _is_hollow(image, part)]
     return [(inside, wall) for inside, wall in rims.tolist() if inside in hollow]
 
 
 def _is_hollow(image: SampledImage, part: Samples) -> bool:
-    """Whether the surface lies behind its own lines; between two things side by side it does, too."""
+    """Whether the surface lies behind its own lines, as that of a vessel does, and is no wider than a vessel."""
     if part.width > convex_pieces.WIDEST_HOLLOW:
         return False
     gap = crossings.gaps(part.pixels, part.points, image.depth, image.labels).mean()
@@ -154,8 +158,11 @@ def _is_hollow(image: SampledImage, part: Samples) -> bool:
 
 
 def _parted(image: SampledImage) -> tuple[list[Samples], list[int]]:
-    """Part segments that are several convex bodies, in the image's labels; samples of all segments that have enough,
-    and which segment each label is of."""
+    """Give the parts of segments that are several convex bodies labels of their own, in the image.
+
+    Returns samples of all segments and parts that are large enough to have some, and, for each label, the label of the
+    segment that it was a part of.
+    """
     extents = regions.extents(image.labels)
     origin = list(range(len(extents)))
     order = np.argsort(-extents[:, 0], kind="stable")
@@ -186,8 +193,11 @@ def _crossed_between(
     insides: list[tuple[int, int]],
     holds: Callable[[np.ndarray], bool] | None,
 ) -> np.ndarray:
-    """Of each two segments the share (n, n) of crossed lines, 0 if they go on behind something nearer or are of one
-    vessel, inf if they are neither near nor that, or no thing together."""
+    """Share (n, n) of crossed lines between each two segments.
+
+    0 where two go on behind something nearer or are of one vessel; inf where they are neither these nor near each
+    other, or where their points together are no thing.
+    """
     names = np.array([part.label for part in parts])
     together = pixels, points, ends = _together(parts)
     borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)

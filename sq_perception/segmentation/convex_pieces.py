@@ -88,8 +88,11 @@ def pieces(
 
 
 def _gathered(group: np.ndarray, crossed: np.ndarray, beside: np.ndarray) -> np.ndarray:
-    """Groups (n,) of samples without strays: a clump of a group apart from its largest one goes to the group that it
-    lies ``beside`` (n, n) and has the most free lines to, if these are as free as within a body."""
+    """Groups (n,) of samples without strays.
+
+    Where a group falls into several clumps, all but its largest clump are strays.  A stray goes to the group that it
+    lies ``beside`` (n, n) and has the fewest crossed lines to, if these are as few as within a body.
+    """
     joined = np.where(beside & (group[:, None] == group), 0.0, np.inf)
     clump = linked(joined, np.ones(len(group)), 1.0)
     of_group = group[np.unique(clump, return_index=True)[1]]
@@ -108,7 +111,7 @@ def _gathered(group: np.ndarray, crossed: np.ndarray, beside: np.ndarray) -> np.
 
 
 def _with_whole_vessels(group: np.ndarray, gap: np.ndarray, far: np.ndarray, hollow: float) -> np.ndarray:
-    """Groups (n,) of samples, from 0, with those of each vessel joined: one group where they are all of a vessel.
+    """Groups (n,) of samples, from 0, with those of each vessel joined; one group where the segment is a vessel.
 
     A group whose surface lies behind its own lines, by more than ``hollow`` of ``gap`` (n, n) on average, is an inside;
     the nearest other one, by ``far`` (n, n), is its wall.

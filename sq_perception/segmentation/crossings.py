@@ -55,8 +55,11 @@ def between(
     noise: float,
     least: float,
 ) -> np.ndarray:
-    """Share (n, n) of crossed lines between the samples of segments, the rows between two ``ends``; inf where two are
-    not ``beside`` each other, bool (n, n), and their nearest samples farther apart than the sum of their reaches."""
+    """Share (n, n) of crossed lines between the samples of each two of n segments.
+
+    The samples of segment k are the rows ``ends[k]`` to ``ends[k + 1]``.  inf for two that are neither ``beside`` each
+    other, bool (n, n), nor have samples nearer to each other than the sum of their reaches (n,), metres.
+    """
     n = len(ends) - 1
     share = np.full((n, n), np.inf)
     for a in range(n):

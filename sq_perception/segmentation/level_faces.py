@@ -6,8 +6,8 @@ one stands alone.  Of the heights of a segment above the support
 
     a face is where most of them lie within a tolerance of one height,
 
-higher than the support is ever seen risen, as a plane whose normal is the support's, and more than what is above it:
-the bottom of a vessel lies low, and its wall is most of what is seen of it.
+higher than the support is ever seen risen; it is a plane with the normal of the support, and more points lie on it
+than above it: the bottom of a vessel lies low, and its wall is most of what is seen of it.
 
 Metres, optical frame.
 """
@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.geometry.quantiles import densest, quantile
+from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
@@ -35,14 +35,14 @@ With twice as many of both, 30 instead of 32 of 289 simulated things on cartons 
 
 @dataclass(frozen=True, eq=False)
 class LevelFace:
-    """A level face of a segment, as a support, and points (n, 3) of all of that segment."""
+    """A level face of a segment, as a support, and points (n, 3) of the whole segment, evenly taken."""
 
     label: int
     surface: SupportSurface
     points: np.ndarray
 
     def under(self, labels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Pixels, bool (height, width), of the segment and of those whose middle is right above it."""
+        """Pixels, bool (height, width), of the segment itself and of all segments whose middle is right above it."""
         axes = TURNS @ support_plane.across(self.surface.plane.equation[:3]).T
         reach = axes @ self.points.T
         low, high = reach.min(axis=1), reach.max(axis=1)
@@ -70,7 +70,7 @@ def found(
     support: SupportSurface,
     least: int,
 ) -> list[LevelFace]:
-    """Segments with a level face above which some of them is, and that face; in the order of ``segments``.
+    """The level faces of segments that have one, and at least ``least`` pixels above it; in the order of ``segments``.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def found(
     support
         What the segments stand on.
     least
-        Pixels of a segment.
+        Pixels of an object.
     """
     seen = {label: face for label, points in segments.items() if (face := _face(points, support)) is not None}
     extents = regions.extents(labels) if seen else np.empty(0)
@@ -93,7 +93,7 @@ def found(
     for label, face in seen.items():
         everything = _points(labels, label, extents[label], depth, camera, labels.size)
         off = face.plane.height(everything) / noise_growth(everything[:, 2])
-        if np.count_nonzero(off > max(0.5 * TOLERANCE, 4 * face.sigma)) >= least:
+        if np.count_nonzero(off > face.clear_height) >= least:
             faces.append(LevelFace(label, face, segments[label]))
     return faces
 
@@ -102,10 +102,7 @@ def _points(
     labels: np.ndarray, label: int, extent: np.ndarray, depth: np.ndarray, camera: Camera, count: int
 ) -> np.ndarray:
     """Points (n, 3) of a segment, evenly taken, at least ``count`` of them or all."""
-    rows, columns = regions.pixels(labels, label, extent)
-    step = max(1, rows.size // count)
-    rows, columns = rows[::step], columns[::step]
-    return camera.unproject(columns, rows, depth[rows, columns])
+    return regions.some_points(*regions.pixels(labels, label, extent), depth, camera, count)
 
 
 def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
@@ -132,7 +129,7 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
             return None
         if plane[:3] @ support.plane.equation[:3] < support_plane.LEVEL:
             return None
-    sigma = max(support.sigma, 1.4826 * quantile(np.abs(off[on]), 0.5))
+    sigma = max(support.sigma, deviation(np.abs(off[on])))
     face = Plane(plane, np.count_nonzero(on) / len(points), sigma)
     if np.count_nonzero(off > TOLERANCE) > count:
         return None

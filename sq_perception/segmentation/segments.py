@@ -4,14 +4,15 @@ Steps
 -----
 1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it; walls and other
    planes larger than a thing go first.
-2. Components of it that no depth step cuts; this step to step 4 are gone through in
-   :mod:`sq_perception.segmentation.bodies`.
-3. Where lines of sight within a component cross empty space it is several bodies; where none do so between two, or two
-   go on behind something nearer, they are one (:mod:`sq_perception.segmentation.convex_parts`).
-4. Each body down to the edge of the noise on the table.
-5. What stands on the level top of a large segment (:mod:`sq_perception.segmentation.level_faces`) once more, with that
-   top for its support: low before the noise, it was taken for a part of the segment.
+2. Components of it that no depth step cuts (steps 2 to 4: :mod:`sq_perception.segmentation.bodies`).
+3. A component within which lines of sight cross empty space is several bodies.  Two components are one body if no line
+   between them does, or if they go on behind something nearer (:mod:`sq_perception.segmentation.convex_parts`).
+4. Each body is continued down to the edge of the noise on the table.
+5. What stands on the level top of a segment is looked for again, with that top as its support: where it rises by little
+   more than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
 6. Walls of a bin around things go (:mod:`sq_perception.segmentation.enclosures`).
+7. What remains is an object if it stands on the support and is no larger than a thing
+   (:mod:`sq_perception.segmentation.standing`).
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
 Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'
@@ -98,16 +99,9 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     """
     options = options or SegmentationOptions()
     depth, valid = _checked(depth, camera, options.depth_range)
-    least = least_pixels(depth.size)
     if not camera.is_pinhole:
-
-        def is_within(rows: np.ndarray, columns: np.ndarray) -> bool:
-            return options.is_within(camera.unproject(columns, rows, depth[rows, columns]))
-
-        accept = None if options.workspace is None else is_within
-        labels, ids, is_cut = _ordered(depth_steps.components(valid), least, options.max_objects, accept)
-        return Segmentation(labels, None, ids, is_cut=is_cut)
-    if np.count_nonzero(valid) < least:
+        return _in_cube(depth, valid, camera, options)
+    if np.count_nonzero(valid) < least_pixels(depth.size):
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera, options.is_small)
@@ -118,23 +112,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         everything, measured = _checked(depth, camera, EVERYTHING)
         everything = cv2.copyTo(everything, measured.view(np.uint8))
     seen = standing.Seen(everything, known, camera, [other for other in planes if other is not plane], options)
-    if plane is None:
-        free = valid & ~standing.furniture(seen, valid)
-        labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, options.is_small)
-        labels, ids, is_cut = _ordered(labels, least, options.max_objects, standing.alone(seen))
-        return Segmentation(labels, None, ids, is_cut=is_cut)
-    support = support_surface.measured(plane, known, valid, camera)
-    relative = support.image_relative(everything, camera)
-    labels = bodies.above(seen, relative * valid, valid, support)
-    samples = level_faces.samples(labels, known, camera, least)
-    for face in level_faces.found(samples, labels, known, camera, support, least):
-        labels = _unloaded(labels, face, seen, least)
-    around = enclosures.walls(samples, plane.equation)
-    if around:
-        labels = np.where(np.isin(labels, list(around)), 0, labels)
-    test = standing.standing(seen, relative, labels, support)
-    labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA), is_cut)
+    return _without_support(seen, valid) if plane is None else _on_support(seen, valid, plane)
 
 
 def from_labels(
@@ -188,17 +166,17 @@ def from_labels(
 
 
 def least_pixels(size: int) -> int:
-    """Of an object in an image of so many pixels."""
+    """The least number of pixels of an object, in an image of ``size`` pixels."""
     return max(_LEAST_PIXELS, round(_LEAST_SHARE * size))
 
 
 def support_under(
     found: Segmentation, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
 ) -> np.ndarray | None:
-    """The plane (4,) that the surroundings of one object show below it; None where they show none but the known one.
+    """The plane (4,) that the surroundings of one object show below it; None if they show none but the segmentation's.
 
-    For objects that do not stand on the plane of the segmentation: a frame may show a table, a shelf and the floor.
-    ``depth`` and ``camera`` are those of the segmentation.
+    For objects that do not stand on that one: a frame may show a table, a shelf and the floor.  ``depth`` and
+    ``camera`` are those of the segmentation.
     """
     options = options or SegmentationOptions()
     depth, valid = _checked(depth, camera, options.depth_range)
@@ -229,8 +207,45 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
+def _in_cube(depth: np.ndarray, valid: np.ndarray, camera: Camera, options: SegmentationOptions) -> Segmentation:
+    """The objects of an orthographic image."""
+
+    def is_within(rows: np.ndarray, columns: np.ndarray) -> bool:
+        return options.is_within(camera.unproject(columns, rows, depth[rows, columns]))
+
+    accept = None if options.workspace is None else is_within
+    labels, ids, is_cut = _ordered(depth_steps.components(valid), least_pixels(depth.size), options.max_objects, accept)
+    return Segmentation(labels, None, ids, is_cut=is_cut)
+
+
+def _without_support(seen: standing.Seen, valid: np.ndarray) -> Segmentation:
+    """The objects of an image that shows no support plane."""
+    free = valid & ~standing.furniture(seen, valid)
+    labels = bodies.taken_apart(seen.known, free, seen.camera, _UNKNOWN_SIGMA, seen.options.is_small)
+    least = least_pixels(valid.size)
+    labels, ids, is_cut = _ordered(labels, least, seen.options.max_objects, standing.alone(seen))
+    return Segmentation(labels, None, ids, is_cut=is_cut)
+
+
+def _on_support(seen: standing.Seen, valid: np.ndarray, plane: support_plane.Plane) -> Segmentation:
+    """The objects that stand on a plane of the image."""
+    known, camera, least = seen.known, seen.camera, least_pixels(valid.size)
+    support = support_surface.measured(plane, known, valid, camera)
+    relative = support.image_relative(seen.depth, camera)
+    labels = bodies.above(seen, relative * valid, valid, support)
+    samples = level_faces.samples(labels, known, camera, least)
+    for face in level_faces.found(samples, labels, known, camera, support, least):
+        labels = _unloaded(labels, face, seen, least)
+    around = enclosures.walls(samples, plane.equation)
+    if around:
+        labels = np.where(np.isin(labels, list(around)), 0, labels)
+    test = standing.standing(seen, relative, labels, support)
+    labels, ids, is_cut = _ordered(labels, least, seen.options.max_objects, test)
+    return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA), is_cut)
+
+
 def _unloaded(labels: np.ndarray, face: level_faces.LevelFace, seen: standing.Seen, least: int) -> np.ndarray:
-    """Labels in which what stands on a level face of a segment is taken apart once more, with the face as support."""
+    """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
     relative = face.surface.image_relative(seen.depth, seen.camera)
     valid = face.under(labels, seen.known, seen.camera) & (relative > -support_plane.TOLERANCE)
     parts = bodies.above(seen, relative * valid, valid, face.surface)

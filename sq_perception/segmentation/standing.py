@@ -2,11 +2,11 @@
 
     foot of a point p = p - h(p) n,    h(p) = n.p + d
 
-A thing rises above the support by more than the noise that this has beside it.  It has the support under it: where its
-foot is, and a little below, the camera sees the support, or the thing itself or another one before the support, but
-nothing that lies below it.  Chairs and walls behind a table have their
-feet beyond its edge, where the camera looks past it; their surface runs on below the table's height.  Walls that reach
-down to the support are planes of their own, and larger than things.
+A thing rises above the support, by more than the noise of the support beside it.  The support is under it: at the foot
+of each of its points, and a little below, the camera sees the support, or the thing itself or another one in front of
+the support, but nothing lower than the support.  Chairs and walls behind a table have their feet beyond the table's
+edge, where the camera looks past the table and sees what is lower.  Walls that reach down to the support are planes of
+their own, and larger than things.
 
 Metres, optical frame.
 """
@@ -20,11 +20,19 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import deviation, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.segmentation.options import SegmentationOptions, largest_edge
-from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse, noise_growth
+from sq_perception.segmentation.support_plane import (
+    LEAST_GROWTH,
+    TOLERANCE,
+    Plane,
+    coarse,
+    connected_parts,
+    in_pixels,
+    noise_growth,
+)
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
@@ -58,10 +66,11 @@ _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing.  The larger part
 decides; without it 3 of 81 recorded and simulated frames lose a body."""
 _UNDER, _BELOW = 3.0, 2.0
-"""Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
+"""Tolerances below the support: where a foot is looked at, and from where on a reading there is lower than the support.
+"""
 _SPECKLE = 4
-"""Pixels beside a foot where nothing was measured, at which is looked for the support; 2 to 6 do as well.  Of 188
-things before a D435 and a Kinect v1 3 to 14 degrees above the table 22 are missed, not 48."""
+"""Pixels to the sides of a foot where nothing was measured: readings there tell in its place; 2 to 6 do as well.  Of
+188 things before a D435 and a Kinect v1 3 to 14 degrees above the table 22 are missed, not 48."""
 _GRAZING, _UPRIGHT, _FLAT = 0.25, 0.5, 0.15
 """Cosines of a wall's normal with the rays and with the support's normal, at most, and how far it reaches along it, as
 a share of its width.  Such are 43 of 286 segments of no thing in 215 simulated scenes, most of them bits of bins and
@@ -107,22 +116,17 @@ def furniture(seen: Seen, valid: np.ndarray) -> np.ndarray:
     if not seen.walls:
         return np.zeros(valid.shape, bool)
     k, rows, columns, points = coarse(seen.known, valid, seen.camera)
-    height, width = valid[::k, ::k].shape
-    large = np.zeros((height, width), np.uint8)
+    large = np.zeros(valid[::k, ::k].shape, np.uint8)
     for wall in seen.walls:
-        on = _lie_on(wall, points)
-        lies = np.zeros(large.shape, bool)
-        lies[rows[on], columns[on]] = True
-        parts = depth_steps.components(lies)[rows, columns]
+        parts = connected_parts(rows, columns, _lie_on(wall, points), large.shape)
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
             if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > seen.options.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
-    full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
-    return full[: valid.shape[0], : valid.shape[1]] > 0
+    return in_pixels(large, k, valid.shape)
 
 
 def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) are of a plane."""
+    """Which points (n, 3) lie on a wall, by its own noise."""
     reach = max(0.5 * TOLERANCE, _ON_WALL * wall.sigma) * noise_growth(points[:, 2])
     return np.asarray(np.abs(wall.height(points)) < reach)
 
@@ -130,7 +134,8 @@ def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
 def _of_no_segments(seen: Seen, labels: np.ndarray) -> list[Plane]:
     """Those of the walls whose points are mostly in no segment.
 
-    The tops or the fronts of equal things lie in a plane, too; larger surfaces are no segments (:func:`furniture`).
+    The tops or the fronts of equal things lie in one plane, too, and most of its points are in segments.  Surfaces that
+    are larger than a thing are in none (:func:`furniture`).
     """
     if not seen.walls:
         return []
@@ -145,19 +150,15 @@ def _of_no_segments(seen: Seen, labels: np.ndarray) -> list[Plane]:
 
 
 def alone(seen: Seen) -> ObjectTest:
-    """The test of a segment in an image without a support: no larger than a thing, and not wherever the image ends.
-
-    A surface that runs out of the image on opposite sides fills it.
-    """
+    """The test of a segment in an image without a support: no larger than a thing, and not out of the image on opposite
+    sides, as a surface is that fills the image."""
     measured = seen.depth > 0
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         left, top = int(columns.min()), int(rows.min())
         if regions.fills((left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1), measured):
             return False
-        step = max(1, rows.size // _SAMPLES)
-        r, c = rows[::step], columns[::step]
-        return seen.options.hold(seen.camera.unproject(c, r, seen.known[r, c]))
+        return seen.options.hold(regions.some_points(rows, columns, seen.known, seen.camera, _SAMPLES))
 
     return is_thing
 
@@ -165,7 +166,8 @@ def alone(seen: Seen) -> ObjectTest:
 def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: SupportSurface) -> ObjectTest:
     """The test of whether a segment is a thing that stands on the support, to be asked of the largest ones first.
 
-    What beside a thing is taken for the noise of the support grows less with every other thing that was accepted.
+    The noise of the support is taken from the readings beside a segment.  Every thing that was accepted is left out of
+    them when the next segment is asked about.
 
     Parameters
     ----------
@@ -180,8 +182,8 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
     last_row, last_column = camera.height - 1, camera.width - 1
     around = depth > 0
     measured = np.count_nonzero(around)
-    coarse = depth[::_SPARSE, ::_SPARSE]
-    nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
+    sparse = depth[::_SPARSE, ::_SPARSE]
+    nearest = quantile(sparse[sparse > 0], _STRAY) * (1 + depth_steps.STEP) if sparse.any() else 0.0
     plane = support.plane
     walls = _of_no_segments(seen, labels)
 
@@ -197,12 +199,8 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
             return False
         borders = sum((rows.min() == 0, columns.min() == 0, rows.max() == last_row, columns.max() == last_column))
         for wall in walls:
-            off = np.abs(wall.height(points)) / growth
-            on_it = rows.size < _FACE_SHARE * wall.share * measured
-            if on_it and _top(off) < _BUMP * wall.sigma:
-                return False
-            # A carton's face may be cut by one border; a wall of which little is seen leaves by two.
-            if borders > (0 if on_it else 1) and np.mean(off < 2 * TOLERANCE) > 0.5:
+            is_face = bool(rows.size >= _FACE_SHARE * wall.share * measured)
+            if _is_part(wall, np.abs(wall.height(points)) / growth, is_face, borders):
                 return False
         if not options.hold(points, plane.equation[:3]) or _is_wall(points, plane.equation[:3]):
             return False
@@ -215,6 +213,17 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
     return is_thing
 
 
+def _is_part(wall: Plane, off: np.ndarray, is_face: bool, borders: int) -> bool:
+    """Whether a segment is a part of a wall, by the distances (n,) of its points, as at one metre of depth.
+
+    ``is_face``: whether the plane may be a face of the segment itself; ``borders``: how many of the image's it touches.
+    """
+    if not is_face and _top(off) < _BUMP * wall.sigma:
+        return True
+    # A carton's face may be cut by one border; a wall of which little is seen leaves by two.
+    return bool(borders > (1 if is_face else 0) and np.mean(off < 2 * TOLERANCE) > 0.5)
+
+
 def _is_wall(points: np.ndarray, up: np.ndarray) -> bool:
     """Whether points (n, 3) are one flat and upright face at a grazing angle, and nothing else."""
     variances, axes = np.linalg.eigh(np.cov(points.T))
@@ -224,9 +233,12 @@ def _is_wall(points: np.ndarray, up: np.ndarray) -> bool:
 
 
 def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
-    """Whether the top of a segment is above the noise of the support, of deviation ``sigma`` and as the heights (n,)
-    beside the segment show it: about the support, or about what lies on it there if they are level, as the height of a
-    board or a mat is no noise."""
+    """Whether the top of a segment is above the noise of the support.
+
+    That noise has the deviation ``sigma`` at least, and the one that the heights (n,) beside the segment show: about
+    the support, or, where these heights are level, about their own level, as the height of a board or a mat on the
+    support is no noise.
+    """
     noise = {0.0: _noise(beside, 0.0, top)}
     if beside.size >= _FEWEST:
         level = quantile(beside, 0.5)
@@ -241,8 +253,8 @@ def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
 def _noise(heights: np.ndarray, base: float, top: float) -> np.ndarray:
     """Those of the heights (n,) beside a thing that tell of noise about a base.
 
-    Below the base there is nothing but noise; above it there may be low things, or a wall behind.  These count for what
-    is no higher than a support is ever seen raised.
+    Below the base there is nothing but noise, above it there may be low things or a wall behind.  So the heights below
+    tell of it alone, if there are enough, for a thing that is higher than a support is ever seen raised.
     """
     below = heights[heights < base]
     is_high = top - base > HIGHEST * TOLERANCE
@@ -250,21 +262,22 @@ def _noise(heights: np.ndarray, base: float, top: float) -> np.ndarray:
 
 
 def _spread(heights: np.ndarray, base: float) -> float:
-    """Deviation of heights (n,) from a base, 0 of too few.
+    """Deviation of heights (n,) from a base; 0 for too few of them.
 
-    Where all around lies below the base, as a table is bent or a sensor has it dip beside things, that is a wave, but
-    it is none of the noise.
+    Where most of them lie below the base, as where a table is bent or a sensor shows it lower beside things, that
+    offset is a wave of the surface: a share of it counts (``_WAVE``), and the noise is that about the wave.
     """
     if heights.size < _FEWEST:
         return 0.0
     low = min(quantile(heights, 0.5) - base, 0.0)
-    return max(_WAVE * -low, 1.4826 * quantile(np.abs(heights - base - low), 0.5))
+    return max(_WAVE * -low, deviation(np.abs(heights - base - low)))
 
 
 def _beside(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Heights (n,) of the support beside a segment.
+    """Heights (n,) of the support beside a segment, where its noise is that under the segment.
 
-    Noise grows at the rims of an image and where light is reflected to and fro; ``around`` is false on other things.
+    It is larger near the rims of an image and where light is reflected several times.  ``around``, bool
+    (height, width), is false where nothing was measured and on other things.
     """
     top, left = max(int(rows.min()) - _BESIDE, 0), max(int(columns.min()) - _BESIDE, 0)
     window = slice(top, int(rows.max()) + _BESIDE + 1), slice(left, int(columns.max()) + _BESIDE + 1)
@@ -279,8 +292,8 @@ def _beside(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns:
 def _stands(
     points: np.ndarray, least: float, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane
 ) -> bool:
-    """Whether the support is under points (n, 3), as far as it is seen there or around, of a share of them at least;
-    what the image cuts off counts as supported."""
+    """Whether the support is seen under at least a share ``least`` of points (n, 3), and nothing lower under more of
+    them.  Points whose feet the image cuts off count as supported."""
     feet, past, held, cut_off = _feet(points, plane.equation, depth, relative, camera.lens)
     return past <= held and held + cut_off >= least * feet
 
@@ -289,8 +302,9 @@ def _stands(
 def _feet(
     points: np.ndarray, plane: np.ndarray, depth: np.ndarray, relative: np.ndarray, lens: Lens
 ) -> tuple[int, int, int, int]:
-    """How many feet of points (n, 3) are before the camera, and of these, where something below the support is seen,
-    where the support is, or what stands on it, and how many are beyond the image."""
+    """How many feet of points (n, 3) are in front of the camera; and of these, how many are at a pixel that shows
+    something lower than the support, how many at one that shows the support or what stands on it, and how many are
+    beyond the image."""
     rows, columns = depth.shape
     count, past, held, cut_off = 0, 0, 0, 0
     for i in range(len(points)):

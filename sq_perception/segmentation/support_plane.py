@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 
@@ -87,6 +88,7 @@ LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
 
 _Surface = tuple[np.ndarray, bool]
+"""Points (n, 3), and whether they are a small island before nothing: what may be a body seen face-on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +135,7 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
             break
         near = points[inside]
         spread = np.abs(near @ plane[:3] + plane[3]) / noise_growth(near[:, 2])
-        found.append(Plane(plane, float(inside.sum() / total), float(1.4826 * np.median(spread))))
+        found.append(Plane(plane, float(inside.sum() / total), float(MEDIAN_TO_SIGMA * np.median(spread))))
         points = points[~inside]
     return found
 
@@ -145,15 +147,29 @@ def support(
     camera: Camera,
     is_small: Callable[[np.ndarray, np.ndarray], bool],
 ) -> Plane | None:
-    """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
+    """The plane that things stand on, of some planes of an image; None if none of them is one.
 
-    What stands on it begins right above it.  A camera is mounted upright or looks straight down.  The table seen from
-    straight above and a wall look alike; a wall counts less, as a floor or a table in the same picture then has a
-    normal that points up.  Of a table and the floor below it things stand on the table, though the picture may show
-    more of the floor; what is no larger than a thing, as ``is_small`` tells of points (n, 3) and their plane's normal,
-    must be a good part of it to be a table.  What hardly anything is close above is no support, such as the wall metres
-    behind a low camera's table, be that in sight or not; nor is the face of a body, unless most of what is on no plane
-    is close above it.  Nor is a plane amid a heap, or a small one beside the camera, such as the side of a shelf.
+    The support has many points, and a normal that points up in the image.  The camera is mounted upright or looks
+    straight down; a table seen from straight above has the normal of a wall, so that such planes count as well, though
+    less: where there is a wall, a floor or a table in the same image has a normal that points up.  What stands on a
+    support begins right above it.  Of a table and the floor below it the table is the support, even if the image shows
+    more of the floor; a plane no larger than a thing is such a table only if it has a good share of the floor's points.
+
+    No support is
+
+    - a plane with hardly anything close above it, such as a wall metres behind the table of a low camera;
+    - the face of a body, unless most of what lies on no plane is close above it;
+    - a plane through a heap, with as many points right above and right below it;
+    - a small plane beside the camera, such as the side of a shelf.
+
+    Parameters
+    ----------
+    candidates
+        As by :func:`planes`.
+    depth, valid : (height, width)
+        Metres, and where they are a measurement.
+    is_small
+        Whether points (n, 3), on a plane with this normal (3,), are no larger than a thing.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
@@ -200,14 +216,12 @@ def around(
     bodies = []
     for label in ids:
         mask = (labels == label) & valid
-        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        left, top, width, height = regions.box(mask)
         margin = 10 + (width + height - 2) // 3
         near[max(top - margin, 0) : top + height + margin, max(left - margin, 0) : left + width + margin] = True
         rows, columns = np.nonzero(mask[top : top + height, left : left + width])
-        step = max(1, rows.size // 500)
-        rows, columns = top + rows[::step], left + columns[::step]
-        bodies.append(camera.unproject(columns, rows, depth[rows, columns]))
-    left, top, width, height = cv2.boundingRect(near.view(np.uint8))
+        bodies.append(regions.some_points(top + rows, left + columns, depth, camera, 500))
+    left, top, width, height = regions.box(near)
     left, top = max(left - _APART, 0), max(top - _APART, 0)
     window = slice(top, top + height + 2 * _APART), slice(left, left + width + 2 * _APART)
     labelled = cv2.dilate((labels[window] > 0).view(np.uint8), np.ones((2 * _APART + 1, 2 * _APART + 1), np.uint8)) > 0
@@ -312,7 +326,7 @@ def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
     """Whether most of a plane's points are on a small island before nothing: a body, seen face-on."""
     on, alone = 0, False
     for points, is_island in surfaces:
-        inside = int(np.count_nonzero(np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])))
+        inside = int(np.count_nonzero(_lie_on(plane, points)))
         if inside > on:
             on, alone = inside, is_island
     return alone
@@ -354,22 +368,44 @@ def coarse(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[int, n
     return k, rows, columns, camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
 
 
+def connected_parts(rows: np.ndarray, columns: np.ndarray, on: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The number, from 1, of the connected part that each sample (n,) of a coarse image of this shape belongs to.
+
+    Parts are those of the samples that are set in ``on``, bool (n,); the others have 0.
+    """
+    mask = np.zeros(shape, bool)
+    mask[rows[on], columns[on]] = True
+    return np.asarray(depth_steps.components(mask)[rows, columns])
+
+
+def in_pixels(mask: np.ndarray, k: int, shape: tuple[int, ...]) -> np.ndarray:
+    """A mask of a coarse image, uint8, in the pixels of the image, bool of its shape; ``k`` pixels a sample."""
+    full = cv2.resize(mask, None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
+    return np.asarray(full[: shape[0], : shape[1]] > 0)
+
+
 def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
     """Points (n, 3) of a coarse image that lie on a plane, of the largest connected part: the tops of two cartons may
     lie in one plane."""
     k, rows, columns, points = coarse(depth, valid, camera)
-    on = np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])
-    lies = np.zeros(depth[::k, ::k].shape, bool)
-    lies[rows[on], columns[on]] = True
-    part = depth_steps.components(lies)[rows, columns]
+    on = _lie_on(plane, points)
+    part = connected_parts(rows, columns, on, depth[::k, ::k].shape)
     counts = np.bincount(part)
     counts[0] = 0
     return np.asarray(points[on & (part == counts.argmax())])
 
 
+def _lie_on(plane: Plane, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) lie within the tolerance of a plane."""
+    return np.asarray(np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2]))
+
+
 def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], list[float], float]:
-    """Of each plane, the share of the points on none of them that are as close above it as what stands on it, and how
-    near they are, 0 to 1; and what share of all points is on none."""
+    """What the points (n, 3) that lie on none of some planes tell of each plane, and their share of all points.
+
+    First the share of them that is as close above the plane as what stands on a support, then how near to it they are,
+    0 to 1.
+    """
     heights = np.stack([plane.height(points) for plane in candidates])
     rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
     if not rest.size:

@@ -28,10 +28,18 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import densest, quantile
+from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse, coarse_stride, noise_growth
+from sq_perception.segmentation.support_plane import (
+    LEAST_GROWTH,
+    TOLERANCE,
+    Plane,
+    coarse,
+    coarse_stride,
+    in_pixels,
+    noise_growth,
+)
 
 _ROUNDS = 6
 """Of reweighting, at most: it ends when it is settled."""
@@ -81,6 +89,14 @@ class SupportSurface:
     limit: float
     sigma: float
 
+    @property
+    def clear_height(self) -> float:
+        """Height from which on something is clearly above the surface, metres at one metre of depth.
+
+        Half of the tolerance is a compromise: bent depth of real cameras stays below, thin objects stay above.
+        """
+        return max(0.5 * TOLERANCE, 4 * self.sigma)
+
     def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
         """Height, float32 (height, width), above the bent surface as at one metre of depth, 0 for depth 0; of a pinhole
         camera's depth image."""
@@ -123,7 +139,7 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     gained = np.count_nonzero(within < 0.5 * TOLERANCE)
     if gained < _GAIN * np.count_nonzero(np.abs(height) < 0.5 * TOLERANCE):
         return flat
-    return SupportSurface(plane, bend, limit, 1.4826 * quantile(within[within < TOLERANCE], 0.5))
+    return SupportSurface(plane, bend, limit, deviation(within[within < TOLERANCE]))
 
 
 def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
@@ -152,25 +168,9 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     if not reached.any():
         return np.zeros(depth.shape, bool)
     passable = known & (height < HIGHEST * TOLERANCE) & _shallow(height * noise_growth(z), z, known, width)
-    joined = [
-        (here, there, np.abs(z[here] - z[there]) < k * depth_steps.STEP * z[here])
-        for here, there in (
-            ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
-            ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-        )
-    ]
     usual = max(quantile(width[reached], 0.5), 1e-4)
     foot, longest = math.ceil(_FOOT / usual), math.ceil(_RAMP_LENGTH / usual)
-    short = reached
-    for step in range(longest):
-        before = np.count_nonzero(reached)
-        for here, there, near in joined:
-            reached[here] |= reached[there] & near & passable[here]
-            reached[there] |= reached[here] & near & passable[there]
-        if step < foot:
-            short = reached.copy()
-        if np.count_nonzero(reached) == before:
-            break
+    reached, short = _climbed(reached, passable, z, k * depth_steps.STEP, foot, longest)
     reached &= ~_low_things(height, noise_growth(z), known, reached)
     near_tall = cv2.dilate((known & (height >= HIGHEST * TOLERANCE)).view(np.uint8), np.ones((4 * foot + 1,) * 2))
     raised, near = reached & (height > 0.5 * TOLERANCE), depth_steps.components(near_tall > 0)
@@ -178,8 +178,30 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     is_lit = np.bincount(near[raised], minlength=len(beside)) > _ALL_AROUND * beside
     is_lit[0] = False
     reached &= ~_parts_with(raised, raised & ~short) | _parts_with(raised, raised & is_lit[near])
-    full = cv2.resize(reached.view(np.uint8), None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
-    return full[: depth.shape[0], : depth.shape[1]] > 0
+    return in_pixels(reached.view(np.uint8), k, depth.shape)
+
+
+def _climbed(
+    reached: np.ndarray, passable: np.ndarray, z: np.ndarray, step: float, foot: int, longest: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Samples, bool (rows, columns), that are reached from some over passable ones without a step in depth.
+
+    First those within ``longest`` samples, then those within ``foot`` of them; ``step`` is a share of the depth.
+    """
+    across, along = slice(1, None), slice(None, -1)
+    pairs = [((across, slice(None)), (along, slice(None))), ((slice(None), across), (slice(None), along))]
+    joined = [(here, there, np.abs(z[here] - z[there]) < step * z[here]) for here, there in pairs]
+    short = reached
+    for round_ in range(longest):
+        before = np.count_nonzero(reached)
+        for here, there, near in joined:
+            reached[here] |= reached[there] & near & passable[here]
+            reached[there] |= reached[here] & near & passable[there]
+        if round_ < foot:
+            short = reached.copy()
+        if np.count_nonzero(reached) == before:
+            break
+    return reached, short
 
 
 def _parts_with(mask: np.ndarray, marked: np.ndarray) -> np.ndarray:
