@@ -1,8 +1,8 @@
-"""What a frame repeats of the one before it: objects whose pixels, and those around them, read the same but for noise.
+"""Objects that did not change since the frame before: readings in them and around them differ by no more than noise.
 
-A body is what a fit makes of readings.  Where these are the same but for noise, a fit to them would answer the same but
-for what noise makes of it, which is its covariance: the body stands, and neither segmentation nor network nor fit is
-asked again.  It is not refined either: its error is that of the frame it was recovered from, and counts once
+A body is what a fit makes of readings.  Where these differ by noise alone, another fit would differ by what that noise
+makes of it, which is its covariance.  So the body of the frame before stands, without another segmentation, prediction
+or fit.  It is not refined either: its error is that of the frame it was recovered from, and counts once
 (:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
 
 Equation
@@ -42,6 +42,7 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
+from sq_perception.imaging.regions import window as window_of
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference
 from sq_perception.recovery.seen_object import SeenObject
@@ -105,7 +106,7 @@ def repeated(
     options: RecoveryOptions,
     labels: np.ndarray | None = None,
 ) -> Repeated:
-    """What an image repeats of the frame before it, if there is one.
+    """Which bodies of the frame before stand for an image, and whether its segments do; nothing without such a frame.
 
     Parameters
     ----------
@@ -136,13 +137,12 @@ def repeated(
     still = float(np.abs(cv2.blur(patches, (_PATCH, _PATCH))).max()) < _NEW
     smooth = cv2.blur(old, (3, 3))
 
-    due, windows = _due(previous.bodies), extents(shown)
+    due, boxes = _due(previous.bodies), extents(shown)
     kept, repeating = {}, 0
     for body in previous.bodies:
-        if body.label >= len(windows):
+        if body.label >= len(boxes):
             continue
-        _, top, bottom, left, right = windows[body.label].tolist()
-        window = slice(max(top - _BAND, 0), bottom + _BAND), slice(max(left - _BAND, 0), right + _BAND)
+        window = window_of(boxes[body.label], _BAND)
         own = shown[window] == body.label
         had = own & (old[window] > 0)
         if np.count_nonzero(had & (new[window] > 0)) <= _MOST * np.count_nonzero(had):

@@ -85,12 +85,10 @@ class SeenObject:
     def points(self) -> np.ndarray:
         """At most some thousand measured points (n, 3), evenly taken."""
         rows, columns = np.nonzero(self.mask_crop)
-        step = max(1, rows.size // _POINTS)
-        rows, columns = rows[::step], columns[::step]
-        return self.camera_crop.unproject(columns, rows, self.depth_crop[rows, columns])
+        return regions.some_points(rows, columns, self.depth_crop, self.camera_crop, _POINTS)
 
     def heights(self, plane: np.ndarray) -> np.ndarray:
-        """Metres above a plane (4,): of the pixels of ``mask_crop``, NaN elsewhere."""
+        """Heights above a plane (4,), metres, of the pixels of ``mask_crop``; NaN elsewhere."""
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
         return lens.heights(depth, mask, self.camera_crop.lens, plane)
 
@@ -102,7 +100,8 @@ class SeenObject:
 
     @cached_property
     def connected(self) -> np.ndarray:
-        """``mask_crop`` without what a step in depth parts from most of it: the wall behind, in a mask too large."""
+        """``mask_crop`` without what a depth step separates from most of it, such as the wall behind in a mask that is
+        too large."""
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
         return coherent(depth, mask, self.step)
 
@@ -113,7 +112,7 @@ class SeenObject:
         return quantile(heights, _LOWEST), quantile(heights, 0.5)
 
     def without(self, strays: np.ndarray) -> SeenObject:
-        """The object as its pixels show it but for those that are set in ``strays``, bool (height, width)."""
+        """The object without the pixels that are set in ``strays``, bool (height, width)."""
         return replace(self, mask=self.mask & ~strays)
 
     def of_readings(self, depth: np.ndarray, gaps: np.ndarray, labels: np.ndarray) -> SeenObject:
@@ -123,8 +122,7 @@ class SeenObject:
 
 
 def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> list[SeenObject]:
-    """The objects of a segmentation, in its order, as far as they were measured; those that were not at all are left
-    out."""
+    """The objects of a segmentation that have a measured pixel, in its order."""
     measured, seen = np.isfinite(depth), []
     for label in found.ids:
         named = found.labels == label
@@ -142,18 +140,15 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
 
 
 def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.ndarray) -> SeenObject:
-    """The object with what goes on from its mask nearly all around, without a step: of a mask too small by some pixels.
+    """The object with a mask that was given some pixels too small completed; any other object as it is.
 
-    Else they would be free space beside the object, and its outline to a network.  Beside a right mask there is the
-    support, what is far behind, or another object.  ``labels`` (height, width) are those of all objects.
+    Such a mask goes on nearly all around without a depth step, while beside a right one there is the support, what is
+    far behind, or another object.  Uncompleted, the missing pixels would pass for free space beside the object, and the
+    mask's border for its outline.  ``labels`` (height, width) are those of all objects.
     """
     if obj.plane is None or not camera.is_pinhole:
         return obj
-    down, across = obj.window
-    top, left = max(down.start - _MOST_ROWS, 0), max(across.start - _MOST_ROWS, 0)
-    around = slice(top, down.stop + _MOST_ROWS), slice(left, across.stop + _MOST_ROWS)
-    near, names = np.ascontiguousarray(depth[around]), labels[around]
-    view = camera.cropped(left, top, near.shape[1], near.shape[0])
+    around, near, names, view = surroundings(obj, depth, labels, camera, _MOST_ROWS)
     unnamed = np.isfinite(near) & (names == 0)
     free = unnamed & (lens.heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
     mask, rows = names == obj.label, 0
@@ -173,10 +168,21 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
     return replace(obj, mask=whole, depth_crop=depth[window], camera_crop=crop, window=window)
 
 
+def surroundings(
+    obj: SeenObject, depth: np.ndarray, labels: np.ndarray, camera: Camera, reach: int
+) -> tuple[tuple[slice, slice], np.ndarray, np.ndarray, Camera]:
+    """The window of the image up to ``reach`` pixels around an object, with its depth, its labels and its camera."""
+    down, across = obj.window
+    top, left = max(down.start - reach, 0), max(across.start - reach, 0)
+    around = slice(top, down.stop + reach), slice(left, across.stop + reach)
+    near = np.ascontiguousarray(depth[around])
+    return around, near, labels[around], camera.cropped(left, top, near.shape[1], near.shape[0])
+
+
 def viewed(
     obj: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
 ) -> SeenObject:
-    """The object with what a network of this configuration is shown, and what its score takes."""
+    """The object with ``shown``, the view for a network of this configuration, and ``view``, that for its score."""
     inner = core(obj, depth, camera)
     shown = None
     if config is not None:
@@ -190,9 +196,10 @@ def viewed(
 
 
 def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """The mask (height, width) without pixels that measured the table or the background: a view is framed by all.
+    """The mask (height, width) without pixels that measured the table or the background.
 
-    Sensors widen what is near, masks from colour what they like.  A thin thing on the table keeps its pixels.
+    A view is framed by all pixels of a mask, but sensors widen what is near, and masks from colour may be too large
+    anywhere.  A thing that is thin above the table keeps all its pixels.
     """
     if not camera.is_pinhole:
         return obj.mask
@@ -203,7 +210,6 @@ def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
     whole = np.zeros_like(obj.mask)
     whole[obj.window] = inner
     # With a margin, as a part that goes on beyond the mask is something else.
-    down, across = obj.window
-    around = slice(max(down.start - 1, 0), down.stop + 1), slice(max(across.start - 1, 0), across.stop + 1)
-    whole[around] &= coherent(np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), obj.step)
+    around, near, inside, _ = surroundings(obj, depth, whole, camera, 1)
+    whole[around] &= coherent(near, np.ascontiguousarray(inside), obj.step)
     return whole

@@ -23,7 +23,7 @@ import numpy as np
 from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import lens
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.recovery.seen_object import SeenObject, surroundings
 from sq_perception.segmentation import segments, support_plane
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.support_plane import TOLERANCE
@@ -59,10 +59,11 @@ def support(
 ) -> np.ndarray | None:
     """The plane (4,) that the object stands on; None where it stands on nothing that is known.
 
-    An object behind the frame's plane does not stand on it, one that goes on below it hardly, and one high above it
-    neither: held before a wall, say.  One less high above it, without anything seen right below it, stands on others,
-    or reaches down to it unseen, as a box seen from above; but not where something of no object borders on it that is
-    no farther away: then it stands on a board of which only the front is seen, before a wall.
+    In this order: the level top of another object, the frame's plane if the object reaches down to it, another plane
+    right below it.  Where there is none of these, an object some way above the frame's plane stands on it all the same:
+    on top of others, or reaching down unseen, as a box seen from above does.  It does not if it lies behind that plane,
+    is high above it, as what is held up before a wall, or if something of no object, no farther away, is beside it:
+    then it stands on a board of which only the front is seen, before a wall.
 
     Parameters
     ----------
@@ -83,31 +84,25 @@ def support(
     other = segments.support_under(found, obj.label, depth, camera, options)
     if other is not None:
         lowest, middle = obj.levels(other)
-        if abs(lowest) < _HOVERING < middle + _HOVERING:
+        if abs(lowest) < _HOVERING and middle > 0:
             return other
-    if (
-        behind
-        or low > _HIGHEST_STACK
-        or (low > _NOT_ON_IT and _is_held(obj, low, depth, camera, found.labels, found.plane))
-    ):
+    if behind or low > _HIGHEST_STACK:
         return None
-    return found.plane
+    is_held = low > _NOT_ON_IT and _is_held(obj, low, depth, camera, found.labels, found.plane)
+    return None if is_held else found.plane
 
 
 def _is_held(
     obj: SeenObject, low: float, depth: np.ndarray, camera: Camera, labels: np.ndarray, plane: np.ndarray
 ) -> bool:
-    """Whether what is of no object, not behind this one, and no lower than its lowest pixels, ``low`` above a plane, is
-    beside a good part of it."""
-    (nearest, farthest), (down, across) = _BESIDE, obj.window
-    top, left = max(down.start - farthest, 0), max(across.start - farthest, 0)
-    around = slice(top, down.stop + farthest), slice(left, across.stop + farthest)
-    near, names = np.ascontiguousarray(depth[around]), labels[around]
+    """Whether something holds an object from the side: readings of no object, not behind it and higher than its lowest
+    pixels, which are ``low`` metres above a plane, along a good part of its outline."""
+    nearest, farthest = _BESIDE
+    _, near, names, view = surroundings(obj, depth, labels, camera, farthest)
     own = (names == obj.label).view(np.uint8)
     outer, inner = (cv2.dilate(own, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (farthest, nearest))
     beside = outer > inner
     seen = beside & (names == 0) & (near < quantile(obj.depth_crop[obj.mask_crop], 0.5) + obj.step)
-    view = camera.cropped(left, top, near.shape[1], near.shape[0])
     above = lens.heights(near, seen, view.lens, plane) > low
     return bool(np.count_nonzero(above) > _HELD * np.count_nonzero(beside))
 

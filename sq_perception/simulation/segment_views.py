@@ -104,8 +104,7 @@ class _Measured:
     camera: Camera
 
     def view(self, labels: np.ndarray, label: int, plane: np.ndarray | None) -> SegmentView:
-        _, top, bottom, left, right = regions.extents(labels)[label].tolist()
-        window = slice(top, bottom), slice(left, right)
+        window = regions.window(regions.extents(labels)[label])
         return segment_view.from_segment(self.depth, labels, label, window, self.camera, plane)
 
     def in_cells(self, view: SegmentView) -> tuple[np.ndarray, np.ndarray]:
