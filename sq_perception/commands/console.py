@@ -69,15 +69,15 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
 
 
 def with_negatives(arguments: Sequence[str]) -> list[str]:
-    """Arguments of a command that takes negative numbers: of -1e-3, -1. and -inf argparse makes options.
+    """Arguments of a command that takes negative numbers, such that argparse takes none of them for an option.
 
-    A blank before it makes a number no option, and is none of the number for ``float``.
+    It does so with -1e-3, -1. and -inf.  Each gets a blank in front, which ``float`` ignores.
     """
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 
 def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
-    """The type of an argument that is a whole number of at least, and perhaps at most, so much."""
+    """The type of an argument that is a whole number from ``least`` to ``most``, or to no end."""
 
     def checked(text: str) -> int:
         try:
@@ -94,7 +94,7 @@ def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
 
 
 def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float]:
-    """The type of an argument that is the wanted number, of which that holds; of one that is no number nothing does."""
+    """The type of an argument that is a number for which ``holds`` is true; ``wanted`` names it in complaints."""
 
     def checked(text: str) -> float:
         try:

@@ -51,33 +51,8 @@ def run(options: argparse.Namespace) -> int:
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
             return misused(problem)
-        recoverer = Recoverer()
         entries: list[dict[str, Any]] = []
-        stems: set[str] = set()
-        code, is_whole = console.SUCCESS, False
-        try:
-            for file, frame in recorded:
-                if isinstance(frame, FrameError):
-                    code = failed(str(frame))
-                elif frame.is_cube:
-                    code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
-                else:
-                    if frame.warning:
-                        complain(f"warning: {frame.name}: {frame.warning}")
-                    stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
-                    try:
-                        bodies = _bodies(stem, frame, recoverer, hand, friction, options)
-                    except (ValueError, ArithmeticError) as error:  # such as a camera of no image
-                        code = failed(f"{file}: {frame.name}: {error}")
-                    else:
-                        stamp = None if frame.stamp is None else frame.stamp._asdict()
-                        entries.append({"file": file, "stamp": stamp, "bodies": bodies})
-            is_whole = True
-        except KeyboardInterrupt:
-            complain("interrupted; what is done so far is kept")
-            code = console.INTERRUPTED
-        except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
-            code = failed(str(error))
+        code, is_whole = _plan_all(recorded, Recoverer(), hand, friction, options, entries)
         chosen = {"gripper": hand.name, "friction": friction}
         document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
         text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist)
@@ -94,10 +69,47 @@ def run(options: argparse.Namespace) -> int:
         return failed(str(error))
 
 
+def _plan_all(
+    recorded: RecordedInput,
+    recoverer: Recoverer,
+    hand: Gripper,
+    friction: float,
+    options: argparse.Namespace,
+    entries: list[dict[str, Any]],
+) -> tuple[int, bool]:
+    """Add the elements of ``frames`` to ``entries``; returns the exit code, and whether all frames were tried."""
+    code = console.SUCCESS
+    stems: set[str] = set()
+    try:
+        for file, frame in recorded:
+            if isinstance(frame, FrameError):
+                code = failed(str(frame))
+                continue
+            if frame.is_cube:
+                code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
+                continue
+            if frame.warning:
+                complain(f"warning: {frame.name}: {frame.warning}")
+            stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
+            try:
+                bodies = _bodies(stem, frame, recoverer, hand, friction, options)
+            except (ValueError, ArithmeticError) as error:  # such as a camera of no image
+                code = failed(f"{file}: {frame.name}: {error}")
+                continue
+            stamp = None if frame.stamp is None else frame.stamp._asdict()
+            entries.append({"file": file, "stamp": stamp, "bodies": bodies})
+    except KeyboardInterrupt:
+        complain("interrupted; what is done so far is kept")
+        return console.INTERRUPTED, False
+    except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
+        return failed(str(error)), False
+    return code, True
+
+
 def _bodies(
     stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Draw the grasps of a frame where that is asked for; its ``bodies``, those that failed last."""
+    """The element ``bodies`` of a frame, those that failed last; writes its picture and its mesh if they are wanted."""
     settings = RecoveryOptions(free_space=frame.has_free_space)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:

@@ -181,36 +181,42 @@ class RecordedBag:
         return count if self._options.limit is None else min(count, self._options.limit)
 
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
+        try:
+            for found in self._paired():
+                if isinstance(found, FrameError):
+                    yield found
+                else:
+                    yield from self._frame(*found)
+        except FrameError as error:
+            yield error
+
+    def _paired(self) -> Iterator[tuple[Message, Message | None] | FrameError]:
+        """The images in their order, each with its camera_info if one is needed and there is one."""
         needs_info = self._options.camera_info is None and not self._orthographic
         latest: Message | None = None
         waiting: Message | None = None
-        try:
-            connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
-            if needs_info:
-                infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic)
-                latest = next(
-                    (message for message in self._reader.messages(infos) if isinstance(message, Message)), None
-                )
-                connections += infos
-            for message in self._reader.messages(connections, self._options.every, self._options.limit):
-                if isinstance(message, FrameError):
-                    yield message
-                    continue
-                is_info = message.kind == CAMERA_INFO
-                if waiting is not None and not (is_info and message.stamp < waiting.stamp):
-                    is_its_own = is_info and message.stamp == waiting.stamp
-                    yield from self._frame(waiting, message if is_its_own else latest)
-                    waiting = None
-                if is_info:
-                    latest = message
-                elif needs_info and (latest is None or latest.stamp != message.stamp):
-                    waiting = message  # the camera_info of its stamp may come right after it
-                else:
-                    yield from self._frame(message, latest)
-            if waiting is not None:
-                yield from self._frame(waiting, latest)
-        except FrameError as error:
-            yield error
+        connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
+        if needs_info:
+            infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic)
+            latest = next((message for message in self._reader.messages(infos) if isinstance(message, Message)), None)
+            connections += infos
+        for message in self._reader.messages(connections, self._options.every, self._options.limit):
+            if isinstance(message, FrameError):
+                yield message
+                continue
+            is_info = message.kind == CAMERA_INFO
+            if waiting is not None and not (is_info and message.stamp < waiting.stamp):
+                is_its_own = is_info and message.stamp == waiting.stamp
+                yield waiting, message if is_its_own else latest
+                waiting = None
+            if is_info:
+                latest = message
+            elif needs_info and (latest is None or latest.stamp != message.stamp):
+                waiting = message  # the camera_info of its stamp may come right after it
+            else:
+                yield message, latest
+        if waiting is not None:
+            yield waiting, latest
 
     # topics
 

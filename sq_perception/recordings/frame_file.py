@@ -249,16 +249,29 @@ def _read(
         return _read_cloud(path, reading)
     if suffix not in SUFFIXES:
         raise ValueError(f"expected a name that ends in {', '.join(SUFFIXES)}")
-    image = {".npy": npy_array, ".exr": exr_image}.get(suffix, grey_image)(path)
+    image = _image(path)
+    if projection == "orthographic":
+        depth, camera = unit_cube.depth_from_grey(image), unit_cube.camera(image.shape[1], image.shape[0])
+        encoding = "mono8" if image.dtype == np.uint8 else "mono16"
+        return RecordedFrame(depth, camera, reading.labels(path.stem, image), path.name, encoding=encoding)
+    return _of_pinhole(path, image, camera_info, distortion, reading)
+
+
+def _image(path: Path) -> np.ndarray:
+    """The pixels (height, width) of an image file, in the units and of the type that it has them."""
+    image = {".npy": npy_array, ".exr": exr_image}.get(path.suffix.lower(), grey_image)(path)
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):  # of one channel, as programs for networks have it
         image = image.reshape(image.shape[1:] if image.shape[0] == 1 else image.shape[:2])
     if image.ndim != 2 or not image.size:
         raise ValueError(f"expected an image (height, width), got {image.shape}")
-    if projection == "orthographic":
-        depth, camera = unit_cube.depth_from_grey(image), unit_cube.camera(image.shape[1], image.shape[0])
-        encoding = "mono8" if image.dtype == np.uint8 else "mono16"
-        return RecordedFrame(depth, camera, reading.labels(path.stem, image), path.name, encoding=encoding)
+    return image
+
+
+def _of_pinhole(
+    path: Path, image: np.ndarray, camera_info: str | Path | None, distortion: Treatment, reading: Reading
+) -> RecordedFrame:
+    """The frame of a pinhole camera's image, which is rectified."""
     is_metric = image.dtype.kind == "f"
     if not is_metric and image.dtype != np.uint16:
         raise ValueError(
@@ -272,7 +285,7 @@ def _read(
     scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
     if reading.scale is not None:
         scale = reading.scale
-    elif suffix == ".png" and _TUM_NAME.fullmatch(path.stem):
+    elif path.suffix.lower() == ".png" and _TUM_NAME.fullmatch(path.stem):
         scale = TUM_SCALE
         warnings.append(
             f"{path.parent}: names as in the TUM RGB-D benchmark, so {TUM_SCALE:g} units are a metre; "
