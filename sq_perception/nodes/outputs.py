@@ -175,7 +175,8 @@ _KINDS = {
 
 
 class OptionalOutputs:
-    """What the parameters ask for, for other stacks; used by one thread at a time, except for ``absent``."""
+    """Messages for other stacks, as far as the parameters ask for them; used by one thread at a time, except for
+    ``absent``."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -223,21 +224,28 @@ class OptionalOutputs:
         heard = self._heard("publish_collision_objects")
         if self._has_another_listener(heard):
             self._scene.forget()
-        if heard is not None and monotonic() >= self._all_due:
+        if heard is not None:
+            self._publish_scene(heard, found, parameters, hidden)
+
+    def _publish_scene(
+        self, planners: Publisher, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
+    ) -> None:
+        """Publish what has changed of the planning scene, from time to time all of it."""
+        if monotonic() >= self._all_due:
             self._scene.repeat()
             self._all_due = monotonic() + _ALL_AGAIN
-        if heard is not None and parameters.publish_collision_objects and has_frame:
-            meshes = (lambda: found.meshes) if parameters.collision_shapes == "mesh" else None
-            objects = self._scene.changes(
-                found.array,
-                found.header,
-                hidden,
-                rests=bool(parameters.target_frame) or not parameters.fixed_frame,
-                meshes=meshes,
-                prefix=parameters.tf_prefix,
-            )
-            if objects:
-                heard.publish(collision_objects.planning_scene(objects))
+        if not (parameters.publish_collision_objects and found.header.frame_id):
+            return
+        objects = self._scene.changes(
+            found.array,
+            found.header,
+            hidden,
+            rests=bool(parameters.target_frame) or not parameters.fixed_frame,
+            meshes=(lambda: found.meshes) if parameters.collision_shapes == "mesh" else None,
+            prefix=parameters.tf_prefix,
+        )
+        if objects:
+            planners.publish(collision_objects.planning_scene(objects))
 
     def withdraw(self) -> bool:
         """Remove every object that was added to the planning scene, as nobody looks after it; whether there was one."""
@@ -268,8 +276,8 @@ class OptionalOutputs:
     def _has_another_listener(self, heard: Publisher | None) -> bool:
         """Whether there is a planner that was not there at the last frame.
 
-        Their number alone misses one that has started again meanwhile; who they are alone one that is known and cannot
-        be reached yet.
+        Both their number and their identities are compared: the number does not show a planner that has started again
+        meanwhile, the identities do not show one that was known before it could be reached.
         """
         number, names = self._listeners
         if heard is None:

@@ -21,6 +21,8 @@ from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 RAW, POINTS = "raw", "points"
 """Plain images, and clouds of points, as image_transport names them."""
 EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
+_KEEPS_ALL = 100.0
+"""Metres: the value of depth_max that leaves nothing out."""
 
 
 def _check_box(name: str, box: tuple[float, ...]) -> None:
@@ -63,16 +65,21 @@ class RecoverParameters(Parameters):
         live=False,
     )
     s: float = setting(
-        117.3,
+        RecoveryOptions.sharpness,
         "Sharpness of the soft occupancy sigma(s (1 - F^e1)) of the score.",
         within=(0.1, 1000.0),
     )
-    tau: float = setting(4.82, "Sharpness of the soft depth projection, likewise.", within=(0.1, 100.0))
+    tau: float = setting(RecoveryOptions.tau, "Sharpness of the soft depth projection, likewise.", within=(0.1, 100.0))
     depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0))
-    depth_max: float = setting(100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0))
-    max_objects: int = setting(20, "Most bodies a frame, the largest ones.", within=(1, 100))
+    depth_max: float = setting(
+        _KEEPS_ALL,
+        f"Farther readings are left out; {_KEEPS_ALL:g} keeps all.",
+        unit="m",
+        within=(0.001, _KEEPS_ALL),
+    )
+    max_objects: int = setting(RecoveryOptions.max_objects, "Most bodies a frame, the largest ones.", within=(1, 100))
     max_size: float = setting(
-        0.6, "Largest full edge of objects that the node segments.", unit="m", within=(0.01, 100.0)
+        RecoveryOptions.max_size, "Largest full edge of objects that the node segments.", unit="m", within=(0.01, 100.0)
     )
     workspace: tuple[float, ...] = setting(
         EVERYWHERE,
@@ -144,7 +151,7 @@ class RecoverParameters(Parameters):
             method=self.method,
             sharpness=self.s,
             tau=self.tau,
-            depth_range=(self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max),
+            depth_range=(self.depth_min, math.inf if self.depth_max >= _KEEPS_ALL else self.depth_max),
             max_objects=self.max_objects,
             max_size=self.max_size,
             workspace=self.box,

@@ -147,9 +147,9 @@ def share_heaps() -> None:
 
 @contextmanager
 def garbage_postponed() -> Iterator[None]:
-    """No collection within the block; what exists at its end is never collected again, new objects are as ever.
+    """No garbage collection within the block, nor later of the objects that exist at its end; of new ones as ever.
 
-    For the start of a process: what becomes unreachable within the block, or of its objects later, by a cycle stays.
+    For the start of a process: reference cycles among those objects are never freed.
     """
     was_enabled = gc.isenabled()
     gc.disable()
@@ -162,13 +162,14 @@ def garbage_postponed() -> Iterator[None]:
 
 
 def keep_objects() -> None:
-    """Collect garbage once, and leave what is left alone from now on: it lives as long as the node is configured."""
+    """Collect garbage once, and exclude what remains from further collections: it lives as long as a node is
+    configured."""
     gc.collect()
     gc.freeze()
 
 
 def release_objects() -> None:
-    """Collect everything that cannot be reached, what was left alone included; leave what is left alone again."""
+    """As :func:`keep_objects`, but the objects that were excluded before are collected too."""
     gc.unfreeze()
     keep_objects()
 
