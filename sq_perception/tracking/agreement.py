@@ -5,10 +5,13 @@ With the error e = z - x^ and S, the covariances of both added as if they erred 
     e^T S^-1 e < chi2_11(0.999)
 
 and neither its centre nor its rotation alone is outside of chi2_3(0.999).  A centre or a rotation that is, by more than
-errors of no importance, has strayed.  What views err by in common is in both and cancels in e: of views from one side
-S is up to 2.5 times too large, and strays are noticed later than need be.  That is a margin for fits that know less
-than they say: with the S of :mod:`~sq_perception.tracking.fusion`, of observations that err twice as much as they say,
-resting bodies move in 9 % of the frames instead of 1 %, and sizes after forty of them err 1.7 % instead of 0.7 %.
+errors of no importance, has strayed.
+
+Errors that views have in common are in both, the estimate and the observation, and cancel in e.  So for views from one
+side S is up to 2.5 times too large, and strays are noticed later than they could be.  That is a margin for fits whose
+errors are larger than they say: if observations err twice as much as they say, then with the S of
+:mod:`~sq_perception.tracking.fusion` resting bodies move in 9 % of the frames instead of 1 %, and sizes after forty
+frames err by 1.7 % instead of 0.7 %.
 """
 
 from __future__ import annotations

@@ -91,7 +91,7 @@ def in_place(
 
 
 def twins(states: np.ndarray) -> np.ndarray:
-    """(n, n) of states (n, 12), whether each is a twin of which one before it."""
+    """Whether state i is a twin of an older state j, bool (n, n), of states (n, 12), the oldest first."""
     return np.tril(_apart(states, states) < _DEEP, -1)
 
 
@@ -117,7 +117,7 @@ def elsewhere(
 
 
 def warm_up() -> None:
-    """Load what is compiled, or compile it."""
+    """Compile, or load from disk, every kernel."""
     _apart(np.ones((1, 12)), np.ones((1, 12)))
     cheapest(np.ones((1, 1)))
 

@@ -191,6 +191,6 @@ def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observe
         body.to_flat(),
         covariance,
         observation.superquadric.to_flat(),
-        own if known else 0 * np.eye(LENGTH),
+        own if known else np.zeros((LENGTH, LENGTH)),
     )
     return Superquadric.from_flat(found), changed if known else own

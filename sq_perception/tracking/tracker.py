@@ -159,7 +159,8 @@ class Tracker:
 
 
 def _asked_once(look: Callable[[np.ndarray], np.ndarray]) -> _Expected:
-    """Of each body it is looked once in a frame: one that was not seen is where it was predicted to be."""
+    """A function that looks for each body once in a frame and keeps the answer, as a body that was not seen stays
+    where it was predicted to be."""
     known: dict[int, bool] = {}
 
     def expected(bodies: Sequence[Body]) -> np.ndarray:
@@ -197,9 +198,9 @@ def _in_world(
 
 
 def _repeated(bodies: _Bodies, observed: np.ndarray, stamp: float) -> _Bodies | None:
-    """The bodies after observations that are all, to the bit, what showed them to be there the frame before.
+    """The bodies after a frame whose observations are all equal, to the bit, to those of the frame before.
 
-    None if they are not.  Nothing has to be compared: a table at which nothing happens costs next to nothing.
+    None for any other frame.  Nothing else is compared then: a table at which nothing happens costs next to nothing.
     """
     by_answer = {body.answer.tobytes(): k for k, body in enumerate(bodies) if body.answer is not None}
     tracks = [by_answer.get(each.tobytes(), -1) for each in observed]
@@ -218,7 +219,7 @@ def _pairs(
     stamp: float,
     expected: _Expected,
 ) -> tuple[Pairs, Pairs]:
-    """What was observed in place, and what was moved."""
+    """Pairs of bodies with what was observed in their place, and with what was observed elsewhere."""
     if not bodies:
         return Pairs.none(), Pairs.none()
     states, covariances = stacked(bodies)
@@ -236,7 +237,7 @@ def _pairs(
 
 
 def _placed(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
-    """The bodies, which know whether they were found where they were."""
+    """The bodies with their ``jumps`` counted: how often in a row they were found elsewhere."""
     after = list(bodies)
     for k in here.track:
         if after[k].jumps:
@@ -250,10 +251,10 @@ def _placed(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
 def _still_there(
     bodies: _Bodies, pairs: Pairs, observed: np.ndarray, repeats: Sequence[bool], stamp: float
 ) -> tuple[_Bodies, Pairs]:
-    """The bodies after old answers about them, and the pairs that are to be fused.
+    """The bodies after answers that repeat earlier ones, and the pairs that are left to be fused.
 
-    Old answers are only where these do not say what was fused before, of a body that moves, or where the camera's pose
-    was corrected or the first one was never seen.
+    A repeated answer shows no more than that its body is still there.  It is fused all the same if the body moves or
+    was found elsewhere, or if the answer disagrees with the track, as after a correction of the camera's pose.
     """
     if not len(pairs.track) or not any(repeats):
         return bodies, pairs
@@ -269,7 +270,8 @@ def _still_there(
 
 
 def _compared(bodies: _Bodies, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, agreement.Agreement]:
-    """Covariances (n, 11, 11) and errors (n, 11) of what was observed beside the tracks, and whether they agree."""
+    """Errors (n, 11) of what was observed against the tracks, after their covariances (n, 11, 11), and whether both
+    agree."""
     states, covariances = stacked([bodies[k] for k in pairs.track])
     total, error = covariances + pairs.covariance + _least(states), state.difference(states, pairs.state)
     return total, error, agreement.compared(states[:, 0:3], total, error)
@@ -279,42 +281,13 @@ def _fused(bodies: _Bodies, pairs: Pairs, gamma: np.ndarray, to_camera: np.ndarr
     """The bodies after the observations of pairs, gamma (n,) of each, from directions ``to_camera`` (n, 3)."""
     if not len(pairs.track):
         return bodies
-    some = [bodies[k] for k in pairs.track]
-    states, covariances = stacked(some)
+    states, covariances = stacked([bodies[k] for k in pairs.track])
     least = _least(states)
     common = COMMON_SHARE * pairs.covariance + least
     shared = gamma[:, None, None] * pairs.covariance
     white = (1 - COMMON_SHARE) * pairs.covariance - shared + _LEAST_WHITE * least
     whole = pairs.covariance + least
-    total, error, verdict = _compared(bodies, pairs)
-    turning = np.zeros(len(some), dtype=bool)
-    for k, body in enumerate(some):
-        agrees, slid, turned = verdict.agrees[k], verdict.slid[k], verdict.turned[k]
-        disagreed = 0 if agrees else body.disagreed + 1
-        impatient = disagreed > 0 and (body.is_moving or disagreed >= PATIENCE)
-        if not body.is_moving and body.jumps == 0:
-            # What moves strays to the same side again; errors larger than their covariance do so seldom.
-            slid = slid and agreement.same_side(body.strayed[CENTRE], error[k, CENTRE])
-            turned = turned and agreement.same_side(body.strayed[TURN], error[k, TURN])
-        if impatient and verdict.fits[k] and (slid or turned):
-            turning[k] = turned
-            variance = np.zeros(LENGTH)
-            variance[CENTRE] = (_RESTART * np.linalg.norm(error[k, CENTRE])) ** 2 if slid else 0.0
-            variance[TURN] = (_RESTART * np.linalg.norm(error[k, TURN])) ** 2 if turned else 0.0
-            covariances[k] += np.diag(variance)
-        else:
-            # One stray observation is doubted itself; of several in a row, both sides are.
-            white[k] += (verdict.excess[k] - 1) * whole[k]
-            if disagreed >= PATIENCE:
-                covariances[k] *= verdict.excess[k]
-        some[k] = replace(
-            body,
-            disagreed=disagreed,
-            strayed=np.zeros(LENGTH) if agrees else error[k],
-            velocity=_velocity(body, error[k, CENTRE], slid and impatient, stamp, total[k, CENTRE, CENTRE]),
-            agreed=stamp if agrees or impatient else body.agreed,
-        )
-
+    some, turning = _doubted(bodies, pairs, covariances, white, whole, stamp)
     states, covariances, lasting, views = fusion.fused(
         states,
         covariances,
@@ -345,6 +318,46 @@ def _fused(bodies: _Bodies, pairs: Pairs, gamma: np.ndarray, to_camera: np.ndarr
             answer=None,
         )
     return tuple(after)
+
+
+def _doubted(
+    bodies: _Bodies, pairs: Pairs, covariances: np.ndarray, white: np.ndarray, whole: np.ndarray, stamp: float
+) -> tuple[list[Body], np.ndarray]:
+    """The bodies of pairs with what their observations show of motion and doubt, and which of them turn, bool (n,).
+
+    Where an observation disagrees with its track, the covariances (n, 11, 11) of the tracks and the ``white`` ones of
+    the observations grow, in place; ``whole`` (n, 11, 11) are the observations' with the least error.
+    """
+    some = [bodies[k] for k in pairs.track]
+    total, error, verdict = _compared(bodies, pairs)
+    turning = np.zeros(len(some), dtype=bool)
+    for k, body in enumerate(some):
+        agrees, slid, turned = verdict.agrees[k], verdict.slid[k], verdict.turned[k]
+        disagreed = 0 if agrees else body.disagreed + 1
+        impatient = disagreed > 0 and (body.is_moving or disagreed >= PATIENCE)
+        if not body.is_moving and body.jumps == 0:
+            # What moves strays to the same side again; errors larger than their covariance do so seldom.
+            slid = slid and agreement.same_side(body.strayed[CENTRE], error[k, CENTRE])
+            turned = turned and agreement.same_side(body.strayed[TURN], error[k, TURN])
+        if impatient and verdict.fits[k] and (slid or turned):
+            turning[k] = turned
+            variance = np.zeros(LENGTH)
+            variance[CENTRE] = (_RESTART * np.linalg.norm(error[k, CENTRE])) ** 2 if slid else 0.0
+            variance[TURN] = (_RESTART * np.linalg.norm(error[k, TURN])) ** 2 if turned else 0.0
+            covariances[k] += np.diag(variance)
+        else:
+            # One stray observation is doubted itself; of several in a row, both sides are.
+            white[k] += (verdict.excess[k] - 1) * whole[k]
+            if disagreed >= PATIENCE:
+                covariances[k] *= verdict.excess[k]
+        some[k] = replace(
+            body,
+            disagreed=disagreed,
+            strayed=np.zeros(LENGTH) if agrees else error[k],
+            velocity=_velocity(body, error[k, CENTRE], slid and impatient, stamp, total[k, CENTRE, CENTRE]),
+            agreed=stamp if agrees or impatient else body.agreed,
+        )
+    return some, turning
 
 
 def _least(states: np.ndarray) -> np.ndarray:
