@@ -57,7 +57,7 @@ class RegressorConfig:
     translation_range: tuple[float, float] = (-0.4, 1.4)
     backbone: Backbone = "compact"
     framing: Framing = "cropped"
-    """What the views show; see the module."""
+    """What the views show, as :mod:`sq_perception.learning.regressor` has it."""
     marks_hidden: bool = False
     """Whether views distinguish hidden pixels from background (``CanonicalView.marked``)."""
 
@@ -154,9 +154,11 @@ class MaskConfig:
 
 
 def shown_beside(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:
-    """What the network of things is shown besides: heights (b, p, p) above the planes, and the logarithm of the sides.
+    """What the network of things is shown beside views (b, p, p): heights (b, p, p) above planes (b, 4), and logarithms
+    (b,) of the views' sides ``extents`` (b,), metres, 0 for an unknown side.
 
-    A height is that of what a pixel shows, of a point half way down where it shows nothing.
+    Heights are in sides of the view: of the surface that a pixel shows, or, where it shows none, of the point at half
+    of the cube's depth.
     """
     xp, pixels = array_namespace(views), views.shape[-1]
     across = (xp.arange(pixels, dtype=views.dtype, device=device(views)) + 0.5) / pixels

@@ -102,14 +102,10 @@ def train(
         model = _new_network(config, network).to(device)
         config = replace(config, **{name: getattr(model.config, name) for name in _FORM})
         before = _check_same_run(config, output)
+        _check_batch(config.batch, model.config)
         objective = Objective(
             config.loss, config.points, config.sharpness_start, config.sharpness_end, framing=config.framing
         )
-        if config.batch == 1 and model.config.pixels == model.config.stride:
-            raise ValueError(
-                f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
-                "one number has no deviation to normalise by"
-            )
         layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
         model.to(memory_format=layout)  # type: ignore[call-overload]
         settings = json.dumps(asdict(config))
@@ -126,10 +122,7 @@ def train(
             progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
             images, bodies = batches.batch(config.batch)
             views = torch.from_numpy(images)[:, None].to(device, memory_format=layout)
-            truth = None
-            if objective.needs_labels:
-                labels = bodies.canonical_form() if config.canonical_labels else bodies
-                truth = Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
+            truth = _truth(bodies, config, device) if objective.needs_labels else None
             model.train()
             with mixed_precision(device.type, config.bfloat16):
                 prediction = model(views)
@@ -143,14 +136,10 @@ def train(
             if state.step % config.validation == 0 or finished:
                 state.seconds = time.monotonic() - started
                 if config.average > 0:
-                    at_once = max(config.batch, _CALIBRATION_BATCH)
-                    calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
-                    recalibrate(state.average, torch.from_numpy(calibration)[:, None], at_once)
+                    _recalibrate(state.average, batches, config.batch)
                 record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
                 record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
                 record |= _validated(state.average, validation, objective)
-                print(json.dumps(record), flush=True)
-                state.log(record)
                 _keep(output, state, record, notes)
                 state.plateau.validated(1 - record["iou"])
                 losses.clear()
@@ -181,6 +170,15 @@ def _check_same_run(config: TrainingConfig, output: Path) -> dict[str, Any]:
     return before
 
 
+def _check_batch(batch: int, network: RegressorConfig) -> None:
+    """Raise ValueError for a batch of one number for each channel, which has no deviation to normalise by."""
+    if batch == 1 and network.pixels == network.stride:
+        raise ValueError(
+            f"batch: expected at least 2 with views of {network.pixels} pixels, of which one cell is left: "
+            "one number has no deviation to normalise by"
+        )
+
+
 def validate(
     model: Regressor, views: np.ndarray, truth: Superquadric, objective: Objective | None = None
 ) -> np.ndarray:
@@ -194,12 +192,13 @@ def validate(
 
 
 def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regressor:
+    """The network that a run begins with: one of random weights, or that of ``start``, which keeps its form."""
     if not config.start:
         return Regressor(form or config.regressor())
     model = checkpoint.load(config.start)
     for name in _FORM:
         wanted, brought = getattr(config, name), getattr(model.config, name)
-        if wanted not in (getattr(TrainingConfig, name), brought):  # defaults say nothing: a start keeps its form
+        if wanted not in (getattr(TrainingConfig, name), brought):  # defaults say nothing
             raise ValueError(f"{name}: expected {brought!r}, as the network of start has it, got {wanted!r}")
     model.config = replace(model.config, marks_hidden=model.config.marks_hidden or config.marks_hidden)
     return model
@@ -209,6 +208,18 @@ def _optimizer(config: TrainingConfig, model: Regressor) -> torch.optim.Optimize
     if config.optimizer == "adam":
         return torch.optim.Adam(model.parameters(), config.learning_rate)
     return torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+
+
+def _truth(bodies: Superquadric, config: TrainingConfig, device: torch.device) -> Superquadric:
+    """Labels of a batch as a torch batch on the device, their axes listed as the run wants them."""
+    labels = bodies.canonical_form() if config.canonical_labels else bodies
+    return Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
+
+
+def _recalibrate(model: Regressor, batches: ViewPool | ShuffledBatches, batch: int) -> None:
+    """Measure the normalisations of an averaged network anew, on views of the training."""
+    views, _ = batches.batch(max(CALIBRATION_VIEWS, batch))
+    recalibrate(model, torch.from_numpy(views)[:, None], max(batch, _CALIBRATION_BATCH))
 
 
 def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> ViewPool | ShuffledBatches:
@@ -262,7 +273,9 @@ def _validated(
 
 
 def _keep(output: Path, state: TrainingState, record: dict[str, Any], notes: dict[str, Any]) -> None:
-    """Save the averaged network; as the model too, where no validation was better."""
+    """Log a validation and save the averaged network; as the model too, where no validation was better."""
+    print(json.dumps(record), flush=True)
+    state.log(record)
     names = ["last.safetensors"]
     score = float(np.mean([value for name, value in record.items() if name.startswith("iou") and name != "iou_std"]))
     if score >= state.best:
