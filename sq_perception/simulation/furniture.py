@@ -24,7 +24,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.scenes import plane_depth
+from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
 
 _SHARP = 0.02
@@ -56,9 +56,7 @@ class _Place:
 
     @classmethod
     def around(cls, scene: ThingsOnTable, rng: np.random.Generator, turn: float) -> _Place:
-        yaw = rng.uniform(-turn, turn)
-        c, s = np.cos(yaw), np.sin(yaw)
-        axes = scene.table @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+        axes = scene.table @ turn_about_up(rng.uniform(-turn, turn))
         parts = [placed.parts for placed in scene.placed]
         high = np.max([(each.translation @ axes + each.support(axes.T)).max(axis=0) for each in parts], axis=0)
         low = np.min([(each.translation @ axes - each.support(-axes.T)).min(axis=0) for each in parts], axis=0)

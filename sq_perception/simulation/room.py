@@ -15,7 +15,7 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.simulation.scenes import plane_depth
+from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.things_on_table import ThingsOnTable
 
 _TURN = float(np.deg2rad(70.0))
@@ -59,8 +59,7 @@ def _standing_at(
 ) -> Superquadric:
     """A body on the floor under a point of it, moved from the table where it would reach under its top."""
     least, most = np.log(_HALF_SIZES)
-    size, yaw = np.exp(rng.uniform(least, most, 3)), rng.uniform(0, np.pi)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+    size, turn = np.exp(rng.uniform(least, most, 3)), turn_about_up(rng.uniform(0, np.pi))
     clear = foot @ away - edge - np.hypot(*size[:2])
     centre = foot - min(clear, 0.0) * away + size[2] * table[:, 2]
     return Superquadric(size, rng.uniform(*_SHAPES, 2), centre, quaternions.from_matrix(table @ turn))

@@ -141,21 +141,24 @@ def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: 
     return np.append(normal, far * np.sin(down))
 
 
+def turn_about_up(yaw: float) -> np.ndarray:
+    """The rotation (3, 3) by an angle, radians, about the z axis of a table's frame."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
 def resting_body(
     rng: np.random.Generator, plane: np.ndarray, reach: float = _PLACE_RADIUS
 ) -> tuple[Superquadric, float]:
-    """A random body that touches the plane within ``reach`` of where the camera looks.
-
-    And the radius of the ball about its centre that holds it.
-    """
+    """A random body that touches the plane within ``reach`` metres of where the camera looks, and the radius, metres,
+    of the ball about its centre that holds it."""
     normal, offset = plane[:3], plane[3]
     size, shape = rng.uniform(*_TABLE_SIZE, 3), rng.uniform(*_TABLE_SHAPE, 2)
     upright = int(rng.integers(3)) if shape.max() < _FLAT_BELOW else int(np.argmin(size))
     across = np.cross(normal, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     table = np.stack([across, np.cross(normal, across), normal], axis=1)
-    yaw = rng.uniform(0, 2 * np.pi)
-    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+    turn = turn_about_up(rng.uniform(0, 2 * np.pi))
     axes = np.roll(np.eye(3), upright - 2, axis=1)
     rotation = quaternions.from_matrix(table @ turn @ axes)
     radius, bearing = reach * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)

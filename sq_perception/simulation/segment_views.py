@@ -51,8 +51,13 @@ recovered is 0.6 m long, and what is none is not told by its size."""
 _SMALLER, _SIDES = 0.6, (0.35, 0.9)
 """Share of the scenes of which a smaller image is taken, and its sides in those of the whole one."""
 _OFF, _OFF_SHARE = 0.01, 0.01
+"""Metres, and share of the depth: by less than their sum a reading is off that counts as one of what it shows."""
 _MOSTLY_NOTHING, _SOME_THING = 0.5, 0.3
+"""Shares of a segment's pixels: it has no object if so many show no thing, and no more than so many show one thing."""
 _LEAST_CELLS = 8
+"""Measured cells of a segment: views with fewer are left out."""
+_SMEARED, _NO_OBJECT = -1, -2
+"""In place of a thing's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
 _PIECES = (3, 7)
 """Pieces that a segment is cut into: from, and below."""
 _PURE = 0.7
@@ -108,11 +113,11 @@ class _Measured:
         return segment_view.from_segment(self.depth, labels, label, window, self.camera, plane)
 
     def in_cells(self, view: SegmentView) -> tuple[np.ndarray, np.ndarray]:
-        """What the cells of a view show: labels, -1 for what a sensor smeared; and whether something was measured."""
+        """What the cells (p, p) of a view show, labels or ``_SMEARED``, and whether something was measured there."""
         height, width = self.depth.shape
         grid = np.ix_(np.clip(view.rows, 0, height - 1), np.clip(view.columns, 0, width - 1))
         near = np.abs(self.depth[grid] - self.true_depth[grid]) < _OFF + _OFF_SHARE * self.depth[grid]
-        return np.where(near, self.shown[grid], -1), view.image[..., segment_view.MEASURED] > 0
+        return np.where(near, self.shown[grid], _SMEARED), view.image[..., segment_view.MEASURED] > 0
 
 
 def _measured(rng: np.random.Generator) -> _Measured:
@@ -190,7 +195,7 @@ def _of_pieces(
             some.append(piece)
             of.append(int(counts.argmax()))
     for k in range(len(some)) if len(set(of)) > 1 else rng.permutation(len(some))[:1]:
-        yield view.of_part(some[k]), _truth(cells, known, of[k] or -2)
+        yield view.of_part(some[k]), _truth(cells, known, of[k] or _NO_OBJECT)
 
 
 def _camera(rng: np.random.Generator) -> Camera:
@@ -214,10 +219,11 @@ def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
 
 
 def _object(shown: np.ndarray) -> int:
-    """The thing that most of a segment's pixels show, -2 if they show none."""
+    """The thing that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
     counts = np.bincount(shown, minlength=2)
     most, total = int(counts[1:].argmax()) + 1, counts.sum()
-    return -2 if counts[0] >= _MOSTLY_NOTHING * total and counts[most] <= _SOME_THING * total else most
+    has_none = counts[0] >= _MOSTLY_NOTHING * total and counts[most] <= _SOME_THING * total
+    return _NO_OBJECT if has_none else most
 
 
 def _truth(cells: np.ndarray, known: np.ndarray, thing: int) -> np.ndarray:

@@ -87,6 +87,7 @@ class Ideal(SensorNoise):
 
 
 def check(model: SensorNoise, **limits: tuple[float, float]) -> None:
+    """Raise ValueError unless each attribute that is named here is a finite number within its limits."""
     for name, (low, high) in limits.items():
         value = getattr(model, name)
         if not (np.isfinite(value) and low <= value <= high):
@@ -94,6 +95,6 @@ def check(model: SensorNoise, **limits: tuple[float, float]) -> None:
 
 
 def steepness(cosine: np.ndarray) -> np.ndarray:
-    """theta / (pi/2 - theta)."""
+    """theta / (pi/2 - theta) of the angle of incidence theta with this cosine."""
     theta = np.arccos(np.minimum(cosine, 1))
     return theta / (np.pi / 2 - theta)

@@ -2,6 +2,10 @@
 
 What :mod:`sq_perception.imaging.canonical_view` makes of an image of a body is rendered directly: rays along z on the
 view's own grid, the view fitted to what of the body is visible.  Frames and values are those of that module.
+
+A canonical view is orthographic whatever camera took the image, but a pinhole camera sees less of a body: of a convex
+one just the points whose normals point to the camera.  So the rays along z, less those that meet a point that faces
+away from it, show what the view of an image with any number of pixels does.
 """
 
 from __future__ import annotations
@@ -15,8 +19,8 @@ from sq_perception.geometry.kernels import gauge_derivatives, kernel, parallel_k
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.canonical_view import HIDDEN, MARGIN, NEAREST, OUTLIERS_PER_END
 
-_NOTHING = -1e300
-_BEHIND = -2e300
+_NOTHING, _BEHIND = -1e300, -2e300
+"""In place of the z that a ray meets: it meets no surface, or an occluder before it could."""
 _MOST_ROUNDS = 4
 """Of fitting a view to what it shows; where there is an occluder, the first one finds where that begins."""
 _SAME_EXTENT = 0.005
@@ -62,12 +66,7 @@ def render_views(
     occluder: Occluder | None = None,
     miss: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Superquadric]:
-    """Canonical views of single bodies, without the detour over an image: the source of training data.
-
-    A canonical view is orthographic whatever camera took the image, but a pinhole camera sees less of the body: of a
-    convex body just the points whose normals point to it.  Rays along z, less what faces away from the eye, are so the
-    view of an image with any number of pixels.  The view is fitted to what is visible, as
-    :func:`canonical_view.from_mask` does it.
+    """The canonical view of each body alone, fitted to what is visible of it as :func:`canonical_view.from_mask` does.
 
     Parameters
     ----------
@@ -91,6 +90,11 @@ def render_views(
     images : float32 (n, pixels, pixels)
     bodies : Superquadric
         The batch in the canonical frame of its views.
+
+    Raises
+    ------
+    ValueError
+        For a distance that is not positive, or a share outside of [0, 1).
     """
     lower, upper = bodies.bounding_box()
     side = MARGIN * (upper - lower)[:, :2].max(axis=1)
