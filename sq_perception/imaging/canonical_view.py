@@ -181,11 +181,7 @@ def from_mask(
     whole = camera
     look, wider = np.eye(3), 1.0
     if camera.is_pinhole:
-        middle_u, middle_v = left + 0.5 * (width - 1), top + 0.5 * (height - 1)
-        toward = camera.unproject(np.array(middle_u), np.array(middle_v), np.array(1.0))
-        look = _rotation_to_z(toward / np.linalg.norm(toward))
-        up = upright(plane[:3]) if plane is not None else np.eye(3)
-        look, wider = up @ look, float(np.abs(up[0]).sum() ** 2)
+        look, wider = _looking_at(left + 0.5 * (width - 1), top + 0.5 * (height - 1), camera, plane)
     if find_hidden:
         left, top, width, height = _with_surroundings(left, top, width, height, camera, wider)
     camera = camera.cropped(left, top, width, height)
@@ -256,10 +252,19 @@ def upright(normal: np.ndarray) -> np.ndarray:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
+def _looking_at(u: float, v: float, camera: Camera, plane: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """R_up R_look (3, 3) for the ray of a pixel, and how many times wider than a box the turned box may be."""
+    toward = camera.unproject(np.array(u), np.array(v), np.array(1.0))
+    look = _rotation_to_z(toward / np.linalg.norm(toward))
+    up = upright(plane[:3]) if plane is not None else np.eye(3)
+    return up @ look, float(np.abs(up[0]).sum() ** 2)
+
+
 def _with_surroundings(
     left: int, top: int, width: int, height: int, camera: Camera, wider: float
 ) -> tuple[int, int, int, int]:
-    """The part of the image that a square view of a box of pixels shows, so many times wider as it is turned."""
+    """The part of the image, as a box, that a square view of a box of pixels shows; ``wider`` as by
+    :func:`_looking_at`."""
     side = _SURROUNDINGS * wider * max(width, height)
     right, bottom = left + width, top + height
     beside, above = int(np.ceil(0.5 * (side - width))) + 1, int(np.ceil(0.5 * (side - height))) + 1

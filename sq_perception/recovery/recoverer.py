@@ -203,14 +203,11 @@ class Recoverer:
 
         with timed(milliseconds, "segmentation"):
             measured = _measured(camera.readings(depth), camera)
-            if labels is not None:
-                labels = np.asarray(np.ma.filled(labels, 0), order="C")
-                if labels.shape != measured.shape:
-                    raise ValueError(f"labels: expected the shape of the depth, {measured.shape}, got {labels.shape}")
+            labels = None if labels is None else _masks(labels, measured)
             measured, labels, closed = perforation.filled(measured, labels)
             kept = continuity.repeated(previous, measured, camera, options, labels)
             if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
-                milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
+                milliseconds["total"] = 1e3 * (time.perf_counter() - started)
                 bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
                 return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=kept.reference)
             if kept.reference:
@@ -248,9 +245,8 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = Reference(
-            *continuity.sampled(measured, camera), camera, options, found, age=age, given=labels is not None
-        )
+        readings, stride = continuity.sampled(measured, camera)
+        reference = Reference(readings, stride, camera, options, found, age=age, given=labels is not None)
         if previous is not None and previous.reference is not None and same:
             kept_labels = [body.label for body in bodies if body.repeats]
             reference = continuity.mixed(reference, previous.reference, found.labels, kept_labels)
@@ -267,7 +263,8 @@ class Recoverer:
         options: RecoveryOptions,
         network: Network | None,
     ) -> segments.Segmentation:
-        """The objects of an image: those given, or its own, which a network mends where one predicts hulls."""
+        """The objects of an image: the given masks, or its own segments, which the network of masks improves where
+        ``network`` predicts hulls."""
         if labels is not None:
             return segments.from_labels(labels, depth, camera, options)
         if not (options.repair and isinstance(network, inference.ThingPredictor)):
@@ -280,7 +277,7 @@ class Recoverer:
         return replace(found, labels=np.where(np.isin(found.labels, most), found.labels, 0), ids=most, is_cut=True)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
-        """The objects with their predictions; of bodies with ``auto``, those that a fit asks for are computed then."""
+        """The objects with their predictions; with ``auto``, bodies are predicted only once a fit asks for one."""
         views = [obj.shown for obj in objects if obj.shown is not None]
         if not views:
             return list(objects)
@@ -302,7 +299,8 @@ class Recoverer:
             return list(self._pool.map(function, items))
 
     def _shared(self, function: Callable[[Sequence[int]], list[_Answer]], items: Sequence[int]) -> list[_Answer]:
-        """The function's answers to items; each thread gets its share of them, as networks compute on one."""
+        """The function's answers to all items; each thread calls it once, with a share of them, as a network computes
+        on one thread."""
         share = -(-len(items) // self._threads)
         parts = [items[first : first + share] for first in range(0, len(items), share)] if items else []
         return [answer for part in self._mapped(function, parts) for answer in part]
@@ -349,8 +347,16 @@ def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.ascontiguousarray(np.where(within, depth, np.nan), dtype=np.float32)
 
 
+def _masks(labels: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Given masks, row by row, 0 where they are masked; ValueError if they are not of the shape of the depth."""
+    labels = np.asarray(np.ma.filled(labels, 0), order="C")
+    if labels.shape != depth.shape:
+        raise ValueError(f"labels: expected the shape of the depth, {depth.shape}, got {labels.shape}")
+    return labels
+
+
 def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
-    """The image without what lies out of range of the labelled objects: it is theirs, and none of the free space."""
+    """The image without an object's own readings out of range: left in, they would pass for free space beside it."""
     near, far = depth_range
     if near <= 0 and np.isinf(far):
         return depth
@@ -365,7 +371,7 @@ def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
 
 
 def _wrong_unit(depth: np.ndarray, camera: Camera) -> str:
-    """That the depths (height, width) are hardly metres, NaN where nothing was measured; empty where they may be."""
+    """A warning where depths (height, width), NaN where nothing was measured, are hardly metres; else empty."""
     some = depth[::_SPARSE, ::_SPARSE]
     some = some[np.isfinite(some)]
     if not camera.is_pinhole or not some.size or quantile(some, 0.5) <= GREATEST_MEDIAN:
