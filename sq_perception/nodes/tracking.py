@@ -23,6 +23,8 @@ from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally, TrackingSession
 
 Pose = tuple[np.ndarray, np.ndarray]
+"""Quaternion x y z w (4,) and translation (3,), arrays where :data:`sq_perception.segmentation.options.Pose` has
+numbers."""
 _LEAST_LENGTH = 1e-6
 """Of a quaternion that can be normalised."""
 
@@ -139,16 +141,7 @@ class Tracking:
             self._session.reset()  # another camera: its world is another one
             self._frame_id = frame.header.frame_id
         stamp, resets = 1e-9 * stamp_of(frame) or arrival, self._session.tally.resets
-        pose: Pose | None = None
-        is_known = True
-        if self._fixed_frame:
-            try:
-                pose = self._poses.at(frame.header, self._fixed_frame, parameters.tf_tolerance)
-            except PoseError as error:
-                is_known = False
-                self._node.get_logger().warning(
-                    f"no camera pose in fixed_frame, nothing is fused: {error}", throttle_duration_sec=THROTTLE
-                )
+        pose, is_known = self._camera_pose(frame, parameters)
         try:
             tracks = self._session.follow(
                 recovery.recovered, stamp, pose, is_pose_known=is_known, camera=frame.camera, depth=frame.depth
@@ -159,6 +152,18 @@ class Tracking:
         if self._session.tally.resets > resets:
             self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
         return identified(recovery, tracks, self._session.hidden)
+
+    def _camera_pose(self, frame: Frame, parameters: RecoverParameters) -> tuple[Pose | None, bool]:
+        """The camera's pose in ``fixed_frame``, None without such a frame, and False where it is not known."""
+        if not parameters.fixed_frame:
+            return None, True
+        try:
+            return self._poses.at(frame.header, parameters.fixed_frame, parameters.tf_tolerance), True
+        except PoseError as error:
+            self._node.get_logger().warning(
+                f"no camera pose in fixed_frame, nothing is fused: {error}", throttle_duration_sec=THROTTLE
+            )
+            return None, False
 
     def _forget(self, why: str) -> None:
         self._session.reset()

@@ -122,18 +122,12 @@ def repeated(
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new, sigma = before.depth, sampled(depth, camera)[0], before.segments.sigma
+    old, new = before.depth, sampled(depth, camera)[0]
     shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
-    reach = _REACH * float(old[shown > 0].max(initial=0))
-    change, near = _changed(old, new, reach)
-    spread = ranked(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
-    if spread > _NOISIER * sigma:
+    compared = _compared(old, new, shown, before.segments.sigma)
+    if compared is None:
         return NOTHING
-    level = max(spread, 0.5 * sigma)
-    patches, sums = _in_noise_levels(change, old, new, level, reach)
-    share = max((ranked(sums, 3 * sums.size // 4) / _QUARTILE / _BLOCK) ** 2, 1.0) if sums.size else 1.0
-    if share > _SHARED:
-        return NOTHING
+    change, patches, level, share = compared
     still = float(np.abs(cv2.blur(patches, (_PATCH, _PATCH))).max()) < _NEW
     smooth = cv2.blur(old, (3, 3))
 
@@ -159,6 +153,25 @@ def repeated(
     is_fresh = len(kept) == count or before.age < _OLD
     repeats = is_same and still and 0 < count == repeating and is_fresh
     return Repeated(kept, replace(before, age=before.age + 1) if repeats else None)
+
+
+def _compared(
+    old: np.ndarray, new: np.ndarray, shown: np.ndarray, sigma: float
+) -> tuple[np.ndarray, np.ndarray, float, float] | None:
+    """What changed between two images (rows, columns), in levels of their noise; None where the camera has moved.
+
+    ``shown`` are the labels of the old one, and ``sigma`` is its noise at one metre.  Returns q (rows, columns),
+    clipped, what patches are taken of (rows, columns), the noise level s, and v.
+    """
+    reach = _REACH * float(old[shown > 0].max(initial=0))
+    change, near = _changed(old, new, reach)
+    spread = ranked(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
+    if spread > _NOISIER * sigma:
+        return None
+    level = max(spread, 0.5 * sigma)
+    patches, sums = _in_noise_levels(change, old, new, level, reach)
+    share = max((ranked(sums, 3 * sums.size // 4) / _QUARTILE / _BLOCK) ** 2, 1.0) if sums.size else 1.0
+    return None if share > _SHARED else (change, patches, level, share)
 
 
 def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -> dict[int, Recovery]:
@@ -224,7 +237,10 @@ def _changed(old: np.ndarray, new: np.ndarray, reach: float) -> tuple[np.ndarray
 def _in_noise_levels(
     change: np.ndarray, old: np.ndarray, new: np.ndarray, level: float, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What patches are taken of, and sizes (n,) of the sums over blocks of readings; ``change`` becomes q, clipped."""
+    """What patches are taken of (rows, columns), and sizes (n,) of the sums of q over blocks of readings.
+
+    ``change`` becomes q, clipped, in place.
+    """
     patches = np.empty(change.shape, np.float32)
     for v in range(change.shape[0]):
         for u in range(change.shape[1]):

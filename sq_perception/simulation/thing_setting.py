@@ -102,22 +102,10 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
             others.append(_stand(reach, floor, rng))
         others = _with_neighbours(others, parts, floor, rng)
 
-    elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))
-    roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
-    aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
-    ray = np.array([aside, below, 1.0])
-    look = looking_down(_pitch(ray, elevation, roll), roll)
-    matrix = quaternions.to_matrix(look)
-    near, usual, far = _DISTANCE
-    distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
-    distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
-    middle = 0.5 * (reach[:3] - reach[3:])
-    towards = -matrix[2]
-    before = float(flat_support(parts, towards[None])[0] - towards @ middle)
-    distance = max(distance, (before + _NEAREST) * float(np.linalg.norm(ray)))
     # The table's frame has its origin below the thing, at the height of its lowest point.
     lift = np.array([0.0, 0.0, reach[5]])
-    shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + middle)
+    look, shift, distance = _camera_pose(parts, reach, lift, rng)
+    matrix = quaternions.to_matrix(look)
     parts = moved(parts, look, shift + matrix @ lift)
     surface = None
     if thing.surface is not None:
@@ -136,6 +124,30 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     return Setting(thing_parts, cavities, others_around, table, behind, camera, surface, -floor)
 
 
+def _camera_pose(
+    parts: np.ndarray, reach: np.ndarray, lift: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Optical from table frame of a random camera, a quaternion (4,) and a translation (3,), and how far the thing is.
+
+    The thing's parts (k, 12) are in its own frame, ``reach`` (6,) is its support in SIX_WAYS there, and ``lift`` (3,)
+    leads to the table's frame.
+    """
+    elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))
+    roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
+    aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
+    ray = np.array([aside, below, 1.0])
+    look = looking_down(_pitch(ray, elevation, roll), roll)
+    matrix = quaternions.to_matrix(look)
+    near, usual, far = _DISTANCE
+    distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
+    distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
+    middle = 0.5 * (reach[:3] - reach[3:])
+    towards = -matrix[2]
+    before = float(flat_support(parts, towards[None])[0] - towards @ middle)
+    distance = max(distance, (before + _NEAREST) * float(np.linalg.norm(ray)))
+    return look, distance * ray / np.linalg.norm(ray) - matrix @ (lift + middle), distance
+
+
 def looking_down(pitch: float, roll: float) -> np.ndarray:
     """Optical from table frame, a quaternion: the axis ``pitch`` radians below the horizon, towards the table's y."""
     half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
@@ -144,7 +156,7 @@ def looking_down(pitch: float, roll: float) -> np.ndarray:
 
 
 def _pitch(ray: np.ndarray, elevation: float, roll: float) -> float:
-    """That of a camera whose ray comes down on the table at ``elevation``, or as steeply as it can; radians.
+    """The pitch, radians, of a camera whose ray comes down on the table at ``elevation``, or as steeply as it can.
 
     With r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation).
     """
