@@ -53,7 +53,7 @@ class Child(subprocess.Popen[bytes]):
         return self.poll()
 
     def last_lines(self) -> list[str]:
-        """Its last output, standard output and error together."""
+        """The last lines of its standard output and error."""
         number = self._output.fileno()
         tail = os.pread(number, _TAIL, max(0, os.fstat(number).st_size - _TAIL))
         return tail.decode(errors="replace").splitlines()[-15:]
@@ -68,7 +68,7 @@ class Child(subprocess.Popen[bytes]):
         self.wait()
 
     def send_signal(self, sig: int) -> None:
-        """To the group that it leads."""
+        """Send a signal to the process group that it leads, if it still runs."""
         if self.exit_code is None:
             with suppress(ProcessLookupError):
                 os.killpg(self.pid, sig)

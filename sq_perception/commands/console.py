@@ -42,18 +42,18 @@ def show_log() -> None:
 
 
 def printable(text: str) -> str:
-    """With a question mark for what cannot be shown, such as bytes of a file's name that are no UTF-8."""
+    """A text with question marks for what cannot be shown, such as bytes of a file's name that are no UTF-8."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def failed(message: str) -> int:
-    """The exit code of something that could not be done, with the reason."""
+    """Complain of something that could not be done; returns its exit code."""
     complain(message)
     return FAILURE
 
 
 def misused(message: str) -> int:
-    """The exit code of wrong usage, with the reason."""
+    """Complain of wrong usage; returns its exit code."""
     complain(message)
     return USAGE
 
@@ -123,7 +123,7 @@ def target(text: str) -> Path:
 
 
 def text_target(text: str) -> str:
-    """As :func:`target`, or - for the standard output."""
+    """The type of an argument that names a file to be written, or is - for the standard output."""
     if text == STANDARD_OUTPUT and sys.stdout is None:
         raise argparse.ArgumentTypeError("the standard output is closed")
     return text if text == STANDARD_OUTPUT else str(target(text))
@@ -143,13 +143,14 @@ def replaced_input(
     files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,
 ) -> str:
-    """Which output would take the place of an input, as a sentence; empty if none.
+    """A complaint if an output would replace an input; empty if none would.
 
     Parameters
     ----------
-    files, folders
-        By the option that names them: files, and folders with the suffix of what is written there; None is not asked
-        for.
+    files
+        The files that are written, by the option that names each; None if it was not given.
+    folders
+        The folders that are written to, likewise, each with the suffix of the files there.
     """
     for name, file in files.items():
         path = None if file is None or str(file) == STANDARD_OUTPUT else Path(file)
@@ -162,7 +163,7 @@ def replaced_input(
 
 
 def add_frames(command: argparse.ArgumentParser) -> None:
-    """Which recorded frames are read, and how bodies are recovered from them."""
+    """Add the arguments that tell which recorded frames are read, and how bodies are recovered from them."""
     add = command.add_argument
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
@@ -179,12 +180,12 @@ def add_frames(command: argparse.ArgumentParser) -> None:
 
 
 def add_ignore_masks(command: argparse.ArgumentParser) -> None:
-    """Whether labels of frames are looked at."""
+    """Add the option that leaves the labels of frames unread."""
     command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
 
 
 def add_address(command: argparse.ArgumentParser) -> None:
-    """Where a page is served."""
+    """Add the options that tell where a page is served."""
     add = command.add_argument
     add(
         "--host",

@@ -88,7 +88,7 @@ def train_masks(arguments: Sequence[str]) -> int:
 
 
 def _drawing(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
-    """What both commands that draw take."""
+    """The parser of both commands that draw, with what they share."""
     command = parser(name, _DRAW.format(what=what), f"example:\n  {example}")
     add = command.add_argument
     add("folder", type=Path, help="of the shards")
@@ -112,7 +112,7 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
 
 
 def _training(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
-    """What both commands that train take."""
+    """The parser of both commands that train, with what they share."""
     command = parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
     add = command.add_argument

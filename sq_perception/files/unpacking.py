@@ -32,7 +32,7 @@ class UnpackingError(ValueError):
 
 
 def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """Those of the named arrays that an NPZ archive holds.
+    """The arrays of an NPZ archive that have these names, by name.
 
     Raises
     ------

@@ -113,7 +113,8 @@ class Places(NamedTuple):
 
 
 def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings:
-    """Those of all bodies that are narrow enough and, for a friction mu, meet their surface squarely at its middle."""
+    """The closings along which bodies are narrow enough, and at whose middle fingers meet the surface squarely, for a
+    friction mu."""
     owner = np.repeat(np.arange(len(bodies)), len(DIRECTIONS))
     along = (DIRECTIONS @ bodies.turns.transpose(0, 2, 1)).reshape(-1, 3)
     reach, there = bodies.reaches(owner, along)
@@ -160,10 +161,10 @@ def from_every_side(
 
 
 def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: float) -> Places:
-    """Of each approach those at which the pads meet the body squarely, in all depths and slides.
+    """The places of each approach, in all depths and slides, at which the pads meet the body squarely.
 
-    Of bodies that have none, those where they do not, too.  ``steepest`` is the angle to the normals up to which a pad
-    may hold, radians.
+    A body without any such place has all of its places.  ``steepest`` is the angle to the normals up to which a pad may
+    hold, radians.
     """
     shallow = np.minimum(_ENGAGED - every.near - gripper.tip, every.deepest)
     rows = np.flatnonzero(every.deepest > LEAST_ENGAGED - every.near - gripper.tip)

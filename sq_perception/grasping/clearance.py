@@ -138,7 +138,7 @@ def _reach(m: np.ndarray, body: np.ndarray) -> float:
 
 @inline_kernel
 def _distance(place: np.ndarray, box: np.ndarray) -> float:
-    """Of a place (3,) to a box (6,) in the same frame; negative inside."""
+    """The distance of a place (3,) to a box (6,) in the same frame; negative inside."""
     square, deep = 0.0, -np.inf
     for i in range(3):
         beyond = abs(place[i] - box[i]) - box[3 + i]
@@ -161,7 +161,10 @@ def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) ->
 def _gaps_to_cells(
     frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray
 ) -> np.ndarray:
-    """The same of points (3, j) in cells, those of cell c from ``starts[c]`` on: cells out of reach are passed over."""
+    """As :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.
+
+    Cells that are out of reach are passed over.
+    """
     found = np.empty(len(frames))
     across = 0.5 * math.sqrt(3.0) * _CELL
     of_cells, of_points = np.empty(middles.shape[1]), np.empty(points.shape[1])

@@ -201,7 +201,7 @@ def _trials(
 
 
 def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:
-    """The same, knowing that fingers which end above the middle do not come down to where a body is widest."""
+    """The trials with better margins where fingers end above the middle and so above where a body is widest."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
     beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
     rows = np.flatnonzero((trials.logs[:, 0] < np.log(_CLEAR)) & ((beside * z).sum(axis=1) < 0))
@@ -224,7 +224,7 @@ def _among_others(
     around: Surroundings,
     placement: float,
 ) -> Trials:
-    """The same with the margins that the surroundings decide."""
+    """The best trials with the margins that the surroundings decide."""
     if not len(trials.owner):
         return trials
     boxes = gripper.boxes_at(trials.opening)

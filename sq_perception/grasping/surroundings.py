@@ -112,7 +112,7 @@ class Surroundings:
         return np.asarray(np.mean(~(self.beyond(places) > _EMPTY), axis=-1))
 
     def beyond(self, places: np.ndarray) -> np.ndarray:
-        """By how much what the image shows is farther away than places (..., 3); NaN where it shows nothing."""
+        """How much farther away than places (..., 3) the reading at their pixel is, metres; NaN for no reading."""
         if self.depth is None or self.camera is None:
             return np.full(places.shape[:-1], np.nan)
         camera, flat = self.camera, np.ascontiguousarray(places, dtype=float).reshape(-1, 3)

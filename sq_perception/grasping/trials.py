@@ -75,7 +75,7 @@ class Trials(NamedTuple):
 
 
 def _rank(owner: np.ndarray) -> np.ndarray:
-    """Of each (k,) among those of the same body; bodies are in order."""
+    """The rank, from 0, of each trial (k,) among those of its body; bodies are in order."""
     return np.asarray(np.arange(len(owner)) - np.searchsorted(owner, owner))
 
 

@@ -107,7 +107,7 @@ def _rvl_size(message: bytes) -> tuple[int, int]:
 
 
 def _png_size(message: bytes) -> tuple[int, int]:
-    """Of the PNG after the header; only if it is 16 bit grey and not too large."""
+    """Width and height of the PNG after the header; ValueError unless it is 16 bit grey and not too large."""
     if len(message) < _HEADER.size + _IMAGE_HEADER.size:
         raise ValueError(f"data: expected a header and a PNG, got {len(message)} bytes")
     length, name, width, height, bits, colour = _IMAGE_HEADER.unpack_from(message, _HEADER.size)

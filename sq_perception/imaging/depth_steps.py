@@ -47,7 +47,7 @@ def grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, 
 
 @kernel
 def _grow(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: np.float32) -> None:
-    """The same, in place; a pixel takes the label of the neighbour to the right, to the left, below or above."""
+    """As :func:`grown`, in place; a pixel takes the label of its neighbour to the right, left, below or above."""
     height, width = labels.shape
     chosen = np.empty(free.size, np.int32)
     left = free.size

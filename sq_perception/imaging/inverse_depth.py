@@ -49,7 +49,7 @@ class InverseDepth:
 
     @classmethod
     def of(cls, depth: np.ndarray, camera: Camera) -> InverseDepth:
-        """Of a depth image of the camera (height, width) in metres, positive, +inf or NaN where nothing is seen.
+        """The inverse of a depth image (height, width), metres, positive; +inf or NaN where nothing is seen.
 
         Raises
         ------
@@ -142,7 +142,7 @@ def _apart(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
 
 
 def _smaller_difference(w: np.ndarray, axis: int) -> np.ndarray:
-    """Of the differences to both neighbours the one nearer to 0; at the border the only one."""
+    """Of the differences of each pixel to both its neighbours the one nearer to 0; at the border the only one."""
     if w.shape[axis] == 1:
         return np.zeros_like(w)
     step = np.diff(w, axis=axis)

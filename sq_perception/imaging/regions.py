@@ -159,7 +159,7 @@ def enclosed(met: np.ndarray) -> np.ndarray:
 def _borders(
     labels: np.ndarray, depth: np.ndarray, count: int, near: float, far: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same; of met and beside half of it each way."""
+    """As :func:`borders`; each contact is entered once in ``met`` and ``beside``, for one of the two orders."""
     n = count + 1
     met, beside, behind = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     # The last pixel with a depth in each column, and in this row.

@@ -68,7 +68,7 @@ def shipped() -> dict[str, Path]:
 
 
 def shipped_regressors() -> dict[str, Path]:
-    """Those among them that predict a body."""
+    """The weights that ship with the package and predict a body, by name."""
     return {name: path for name, path in shipped().items() if read_header(path).get("format") == FORMAT}
 
 

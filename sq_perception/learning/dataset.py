@@ -102,7 +102,7 @@ def grey_frames(
 
 
 def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
-    """The same as a network takes them: float32 (n, p, p), z of the surface and 0 for background."""
+    """The thesis' 8 bit images as a network takes them: float32 (n, p, p), z of the surface, 0 for background."""
     grey = grey_frames(bodies, pixels)
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 

@@ -82,7 +82,7 @@ class Settings:
 
     @property
     def dtype(self) -> type[np.unsignedinteger]:
-        """Of the grey levels."""
+        """The type of the grey levels."""
         return np.uint8 if self.framing == "full" else np.uint16
 
     def shards(self, split: str) -> dict[str, int]:

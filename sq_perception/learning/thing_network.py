@@ -90,7 +90,7 @@ class HullPrediction:
         return torch.sqrt(share * torch.diagonal(self.covariance(), dim1=1, dim2=2))
 
     def negative_log_likelihood(self, truth: torch.Tensor) -> torch.Tensor:
-        """Of true support functions (b, J); (b,), a constant left out."""
+        """-log p (b,) of true support functions (b, J), without its constant."""
         count = truth.shape[1]
         distance, log_det = self.distance(truth)
         return 0.5 * log_det + 0.5 * (self.freedom + count) * torch.log1p(distance / self.freedom)

@@ -57,7 +57,7 @@ class Plateau:
 
     @property
     def share(self) -> float:
-        """Of the rate."""
+        """By which the learning rate is multiplied."""
         return _FACTOR**self.reductions
 
     def validated(self, loss: float) -> None:

@@ -1,4 +1,4 @@
-"""What computes in a frame node: a recoverer, made away from the frames, swapped as a whole, shared within a process.
+"""The recoverer of a frame node: made in a thread of its own, swapped as a whole, shared by the nodes of a process.
 
 A change of the parameters that a recoverer is made of (model, device ...) makes another one in a thread of its own,
 warmed up before it is used.  Frames go on with the old one, and with those parameters as they were, until the new one
@@ -34,7 +34,7 @@ WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _MADE_OF = ("device", "threads", "method", "model")
 """Parameters that a recoverer is made of."""
 _READ_BY = frozenset(("model", "device"))
-"""Those whose setting reads the weights; the others keep what is loaded, whatever became of the file."""
+"""Those that, when they are set, have the weights read anew; after a change of the others the loaded ones are kept."""
 
 Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 """The bodies of a frame, and a value that is equal for equal origins."""
@@ -49,7 +49,7 @@ class Turns:
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Wait for one's turn, and keep it for the block."""
+        """Wait for the caller's turn, and hold it for the block."""
         self._take()
         try:
             yield
@@ -58,7 +58,7 @@ class Turns:
 
     @contextmanager
     def pause(self) -> Iterator[None]:
-        """Within one's turn: others have theirs during the block, and the next one is waited for at its end."""
+        """Give the caller's turn away for the block, and wait for another one at its end."""
         self._give()
         try:
             yield
@@ -226,7 +226,7 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
 
 
 def _file(model: str) -> Hashable:
-    """The very file of the weights: another one may take its name."""
+    """What tells the file of the weights from every other one, also from one that takes its name later."""
     path = checkpoint.resolve(model or None)
     try:
         known = path.stat()

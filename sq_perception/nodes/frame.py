@@ -31,12 +31,15 @@ _DIGITS = 3
 
 
 def newest() -> QoSProfile:
-    """For images: a slow subscriber with a queue answers old ones.  Made anew, as rclpy writes overrides into it."""
+    """Quality of service for images: the newest alone, as with a queue a slow subscriber would answer old ones.
+
+    Made anew each time, as rclpy writes overrides into it.
+    """
     return QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 
 
 def latched() -> QoSProfile:
-    """Late comers get the last one: a table that is hidden by an arm is still there.  Made anew, likewise."""
+    """Quality of service for what stays true: who subscribes later gets the last message.  Made anew, likewise."""
     return QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 

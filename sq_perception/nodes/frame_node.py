@@ -310,7 +310,7 @@ class FrameNode(ManagedNode):
         return response
 
     async def _next_outcome(self) -> Outcome:
-        """Of the next frame, or why there is none."""
+        """The outcome of the next frame, or why there is none."""
         source = self._input
         if source is None:
             return Outcome(False, f"the node is {self.state}, not active")

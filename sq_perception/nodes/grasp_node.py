@@ -180,7 +180,7 @@ class GraspNode(ManagedNode):
         return found
 
     def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
-        """Those of grasps of some bodies, which take the place of those before."""
+        """Markers of grasps, by their bodies' ids, which replace the markers before."""
         return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replaced(ids))
 
 

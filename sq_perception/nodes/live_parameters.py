@@ -39,7 +39,7 @@ def setting(
 
 @dataclass(frozen=True)
 class Parameters:
-    """Those of a node.  Types and ranges are rclpy's to check, by the descriptors; what fits together is checked here.
+    """The parameters of a node.  rclpy checks types and ranges, by the descriptors; what fits together is checked here.
 
     Raises ParameterError for a value that is none of the choices, or does not fit the others.
     """
@@ -107,7 +107,7 @@ class LiveParameters(Generic[P]):
         return given
 
     def _values(self, changes: list[Parameter]) -> dict[str, Any]:
-        """By name, without those of rclpy's own, which another thread may declare."""
+        """The values by name, without rclpy's own parameters, which another thread may declare."""
         return {change.name: self._kinds[change.name](change.value) for change in changes if change.name in self._kinds}
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:

@@ -106,9 +106,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return not self._thread.is_alive()
 
     def destroy_node(self) -> None:
-        """As rclpy's, and the publisher of the transitions goes too.
+        """Destroy the node as rclpy does, and the publisher of the transitions too.
 
-        rclpy leaves it to the garbage collector: it stayed in the graph for as long as the process lived.
+        rclpy leaves that one to the garbage collector: it stayed in the graph for as long as the process lived.
         """
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()

@@ -67,7 +67,7 @@ class MarkerIds:
         """Until when they are deleted, in the order in which they went; endless while they are shown."""
 
     def replaced(self, ids: Sequence[int]) -> list[int]:
-        """Those that the next message has to delete, which shows ``ids``."""
+        """The ids whose markers the next message, which shows ``ids``, has to delete."""
         now, shown = monotonic(), dict.fromkeys(ids, math.inf)
         gone = {number: until for number, until in self._until.items() if until >= now and number not in shown}
         again = dict([one for one in gone.items() if one[1] < math.inf][-_MOST_AGAIN:])

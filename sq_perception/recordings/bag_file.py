@@ -250,7 +250,7 @@ class RecordedBag:
         return found[0]
 
     def _encoding(self, topic: str) -> str | None:
-        """Of the first readable image of a topic."""
+        """The encoding of the first readable image of a topic; None where none of the first ones can be read."""
         for message in islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED):
             if isinstance(message, FrameError):
                 continue

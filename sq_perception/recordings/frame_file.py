@@ -371,7 +371,7 @@ def _metres(values: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _single(depth: np.ndarray) -> np.ndarray:
-    """In float32, NaN for what is no reading: some programs write the largest number that their type holds."""
+    """Depth as float32, NaN where it is no reading: some programs write the largest number that their type holds."""
     with np.errstate(over="ignore"):
         found = depth.astype(np.float32)
     return np.where(np.isfinite(found), found, np.float32(np.nan))

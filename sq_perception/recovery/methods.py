@@ -52,9 +52,10 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
 
 
 def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
-    """From the network's prediction; images without noise may not need it, and it is not computed then.
+    """The surface fit, with the prediction if there is one: as a start, and as what is expected of the body where the
+    image leaves it open, such as the depth of a box seen face-on.
 
-    What the image leaves open after all, such as the depth of a box seen face-on, the prediction settles.
+    A prediction may be computed only when the fit asks for it, which it need not do for images without noise.
     """
     if obj.prediction is None:
         return surface_fit.fit(depth, obj.mask, camera, options=known)

@@ -196,16 +196,16 @@ class SegmentNetwork:
         return remain if len(remain) > 1 else []
 
     def _objects(self, doubts: Sequence[_Doubt]) -> list[list[np.ndarray]]:
-        """Of each segment, the logits (p, p) of the objects that pieces of it show, in the cells of its view.
+        """For each segment, the logits (p, p), in the cells of its view, of each object that its pieces show.
 
-        The least sure piece is asked about first, then what no object claims.
+        The network is asked about the least sure piece first, then about pieces that no object claims.
         """
         first = [doubt.view.of_part(doubt.pieces == doubt.sure.argmin()) for doubt in doubts]
         answers = self._logits(first)
         return [self._objects_of(doubt, answer) for doubt, answer in zip(doubts, answers, strict=True)]
 
     def _objects_of(self, doubt: _Doubt, logits: np.ndarray) -> list[np.ndarray]:
-        """The same of one segment, from the logits (p, p) that the least sure piece has."""
+        """The logits (p, p) of each object of one segment, from those of its least sure piece."""
         piece = int(doubt.sure.argmin())
         objects: dict[int, np.ndarray] = {}
         claimed = np.zeros(len(doubt.sure))

@@ -165,6 +165,7 @@ def place_as_text(translation: Iterable[float], is_cube: bool) -> str:
 
 
 def _length(metres: float, is_cube: bool, whole: int) -> str:
-    """To a millimetre, or thousandth of the cube; to a tenth below so many of them."""
+    """A length in millimetres, or as a share of the cube, to a millimetre or a thousandth; to a tenth of that below
+    ``whole`` of them."""
     digits = 0 if 1e3 * metres >= whole else 1
     return f"{metres:.{3 + digits}f}" if is_cube else f"{1e3 * metres:.{digits}f}"

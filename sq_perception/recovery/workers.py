@@ -73,7 +73,7 @@ class WorkerLostError(RuntimeError):
 def recovered(
     frames: Iterable[tuple[_Key, Work | None]], executor: Processes | Cluster
 ) -> Iterator[tuple[_Key, FrameRecovery | Exception | None]]:
-    """In the order of the frames, the recovery of each or what it raised, None for no work.
+    """The key of each frame, in their order, with its recovery or the exception that it raised, None for no work.
 
     An answer may be a :class:`WorkerLostError`.  The executor is shut down in the end.
     """
@@ -246,7 +246,7 @@ def _recover(setup: Setup, work: Work) -> FrameRecovery:
 
 
 def _packed(found: FrameRecovery) -> FrameRecovery:
-    """As it is sent: labels of few bytes, and no reference, as no frame follows it; both are as large as the image."""
+    """A recovery as it is sent: labels in as few bytes as they need, and no reference, as no frame follows it."""
     labels = found.labels.astype(np.min_scalar_type(found.labels.max(initial=0)))
     return replace(found, labels=labels, reference=None)
 

@@ -125,7 +125,7 @@ def _jagged_share(labels: np.ndarray, depth: np.ndarray, count: int, step: np.fl
 
 
 def _large(labels: np.ndarray, least: float) -> np.ndarray:
-    """Those with at least so many pixels, the largest ones if there are very many; labels from 1."""
+    """The labels with at least so many pixels, or the largest of them if there are very many, renumbered from 1."""
     counts = regions.extents(labels)[:, 0]
     kept = counts >= max(least, np.sort(counts)[-_MOST:][0])
     return regions.renumbered(labels, (kept * np.cumsum(kept)).astype(np.int32))

@@ -92,9 +92,12 @@ def hidden(
     noise: float,
     least: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the lines between the samples of ``wanted`` pairs of segments (n, n), by their names (n,): the share of those
-    that leave one along its surface, pass behind another segment, and enter the other one along its surface; and that
-    of crossed ones.  Every second sample of each is taken."""
+    """Two shares (n, n) of the lines between the samples of each two of n segments, labelled ``names`` (n,).
+
+    First that of the lines which leave one segment along its surface, pass behind a third one, and enter the other one
+    along its surface; then that of crossed lines.  For the ``wanted`` pairs, bool (n, n), by every second sample; 0 for
+    others.
+    """
     n = len(names)
     along, crossed = np.zeros((n, n)), np.zeros((n, n))
     for a in range(n):
@@ -139,7 +142,7 @@ def hidden(
 def within(
     pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, noise: float, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of each pair of samples (n, n): 1 where the line is crossed, and the distance, metres."""
+    """For each pair of samples (n, n), 1 where the line between them is crossed, else 0, and their distance, metres."""
     n = pixels.shape[0]
     crossed, far = np.zeros((n, n)), np.zeros((n, n))
     for i in range(n):
@@ -154,7 +157,10 @@ def within(
 
 @kernel
 def gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """Mean gap (n, n) behind the line of each pair of samples over its own segment, metres; 0 without any of that."""
+    """How far the surface lies behind the line between each pair of samples (n, n), metres, on average.
+
+    Taken where the line runs over the samples' own segment; 0 where it does not.
+    """
     n = pixels.shape[0]
     found = np.zeros((n, n))
     for i in range(n):

@@ -64,8 +64,8 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
 
 
 def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each of m segments, how much farther its points (n, 2) reach along their longer principal axis, as a variance
-    (m,), and those axes (m, 2, 2) in columns, the shorter one first."""
+    """The difference (m,) of the variances of m segments' points (n, 2) along their principal axes, and these axes
+    (m, 2, 2), in columns, the shorter one first."""
     counts = np.bincount(owner)
     centred = points - np.stack([np.bincount(owner, column) / counts for column in points.T], axis=1)[owner]
     x, y = centred.T

@@ -107,7 +107,7 @@ def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
 
 
 def _extents(values: np.ndarray) -> np.ndarray:
-    """Of each row, without what sticks out."""
+    """The extent of the values of each row, without what sticks out."""
     ordered = np.sort(values, axis=1)
     out = int(_OUTLIERS * values.shape[1])
     return np.asarray(ordered[:, -1 - out] - ordered[:, out])

@@ -29,14 +29,14 @@ another, is a part of that.  Nearer the same angle holds, as smaller ones are se
 
 
 def stride(pixels: int, count: int) -> int:
-    """Of a grid that takes some ``count`` of so many pixels, twice as many at most."""
+    """The stride of a grid that takes about ``count`` of so many pixels, at most twice as many."""
     step = max(1, math.isqrt(pixels // count))
     return step + 1 if pixels > 2 * count * step**2 else step
 
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Of a segment: pixels (n, 2) as row and column, points (n, 3), and their distance on the grid in metres."""
+    """Samples of a segment: pixels (n, 2) as row and column, points (n, 3), and their spacing on the grid, metres."""
 
     label: int
     pixels: np.ndarray
@@ -54,7 +54,7 @@ class Samples:
 
     @property
     def width(self) -> float:
-        """Of the larger side of the box around it across the line of sight, metres."""
+        """The larger side of the box around the segment across the line of sight, metres."""
         return float(np.ptp(self.points[:, :2], axis=0).max())
 
 
@@ -74,7 +74,7 @@ class SampledImage:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """By which a line is crossed: standard deviation at one metre, and metres."""
+        """``noise`` and ``least`` by which a line is crossed (:mod:`sq_perception.segmentation.crossings`)."""
         return _NOISE_MARGIN * self.sigma, _LEAST_GAP
 
     def sampled(self, label: int, extent: np.ndarray, count: int) -> Samples | None:
@@ -93,10 +93,10 @@ class SampledImage:
         )
 
     def area(self, samples: Samples, extent: np.ndarray) -> float:
-        """Of all of a segment across the line of sight, square metres."""
+        """The area of a whole segment across the line of sight, square metres."""
         return float(extent[0]) * (samples.distance / self.focal) ** 2
 
 
 def least_area(z: float) -> float:
-    """Of a body that is attached to another, at a depth in metres: square metres across the line of sight."""
+    """The least area that a body attached to another shows at a depth, square metres across the line of sight."""
     return _LEAST_AREA * min(1.0, z / _NEAR) ** 2

@@ -106,7 +106,7 @@ class Seen:
 
 
 def _top(values: np.ndarray) -> float:
-    """Their 95 % quantile; sensors smear edges."""
+    """The 95 % quantile of some values, as sensors smear edges."""
     k = int(0.95 * len(values))
     return float(np.partition(values, k)[k])
 

@@ -303,7 +303,7 @@ def _through_three(points: np.ndarray, count: int, rng: np.random.Generator) -> 
 
 @kernel
 def _votes(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Of each plane (n, 4) how many points (4, m), divided by their tolerance, are within it."""
+    """How many points (4, m), divided by their tolerance, lie within it of each plane (n, 4)."""
     votes = np.zeros(len(planes), np.int32)
     for k in range(len(planes)):
         a, b, c, d = planes[k]

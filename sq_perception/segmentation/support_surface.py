@@ -270,7 +270,7 @@ def _add_reached_tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray
 def _normal_equations(
     x: np.ndarray, y: np.ndarray, height: np.ndarray, off: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the least squares fit of b to the heights of samples that are within the tolerance of the last one."""
+    """The normal equations of b by least squares, from the heights of samples within the tolerance of the last b."""
     gram, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
     for i in range(len(x)):
         if abs(off[i]) < TOLERANCE:

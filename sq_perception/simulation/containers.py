@@ -60,7 +60,7 @@ def bottle(rng: np.random.Generator) -> Thing:
 
 
 def _shoulders(rng: np.random.Generator, a: float, b: float, e2: float, low: float, high: float) -> list[Row]:
-    """From the straight body, which ends at the height ``low``, to the neck at ``high``."""
+    """The parts between the straight body, which ends at the height ``low``, and the neck at ``high``."""
     rise = high - low
     round_e2 = max(e2, rng.uniform(0.7, 1.0))
     if rng.random() < 0.6:  # a dome

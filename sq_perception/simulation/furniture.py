@@ -125,8 +125,8 @@ def _bin(place: _Place, rng: np.random.Generator) -> _Parts:
 
 @dataclass(frozen=True)
 class _Kind:
-    """Of furniture: its parts, most things, degrees above it of the camera, radians by which it is turned at most, and
-    whether it is a thing."""
+    """A kind of furniture: its parts, the most things on it, how many degrees the camera is above it, by how many
+    radians it is turned at most, and whether it is a thing itself."""
 
     parts: Callable[[_Place, np.random.Generator], _Parts]
     most: int

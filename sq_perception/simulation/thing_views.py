@@ -141,7 +141,8 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
 
 
 def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """In some images something nearer that comes in from one side: a straight edge, a corner or a round thing."""
+    """The image and the thing's mask; in some something nearer comes in from one side: a straight edge, a corner or a
+    round thing."""
     if rng.random() > BEFORE or not seen.any():
         return depth, seen
     v, u = np.nonzero(seen)
@@ -205,7 +206,7 @@ def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _cut(
     measured: np.ndarray, mask: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """Some images end within the thing or near to it."""
+    """The image and the mask, in some cases cut off within the thing or near to it, and their camera."""
     if rng.random() > 0.1:
         return measured, mask, camera
     v, u = np.nonzero(mask)

@@ -83,7 +83,7 @@ class PlacedThing:
 
     @property
     def parts(self) -> Superquadric:
-        """In the optical frame."""
+        """The thing's parts in the optical frame."""
         return Superquadric.from_flat(moved(self.thing.parts.to_flat(), self.rotation, self.translation))
 
 

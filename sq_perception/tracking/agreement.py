@@ -32,10 +32,10 @@ Chosen: a millimetre or two of a household thing, and 3 degrees."""
 
 
 class Agreement(NamedTuple):
-    """Of n observations, all (n,).
+    """How n observations agree with their tracks; all (n,).
 
-    ``agrees``, ``fits`` (sizes and exponents agree), ``slid``, ``turned``: bool.  ``excess``: e^T S^-1 e over its
-    limit, at least 1.
+    ``agrees`` as a whole, ``fits`` in sizes and exponents, ``slid`` or ``turned``, if centre or rotation strayed: bool.
+    ``excess`` is e^T S^-1 e over its limit, at least 1.
     """
 
     agrees: np.ndarray

@@ -162,7 +162,7 @@ def fused(
 
 
 def _variances(covariance: np.ndarray) -> np.ndarray:
-    """Of the numbers (n, 11) of covariances (n, 11, 11), the mean for those of the centre: the same in any world."""
+    """The variances (n, 11) of covariances (n, 11, 11), for the centre their mean, which is the same in any world."""
     variances = np.einsum("nii->ni", covariance).copy()
     variances[:, CENTRE] = variances[:, CENTRE].mean(axis=1, keepdims=True)
     return variances
