@@ -81,32 +81,36 @@ def _render(options: argparse.Namespace) -> int:
     from sq_perception.files.unpacking import MOST_PIXELS
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging import raycast, unit_cube
-    from sq_perception.imaging.camera import Camera
 
     try:
         given = np.array([getattr(options, name) for name in PARAMETERS])
         if not np.isfinite(given).all():
             return misused(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
         body = Superquadric.from_flat(given)
-        if pinhole:
-            seen = body
-            width, height = options.width or 640, options.height or 480
-            focal = 525.0 if options.focal is None else options.focal
-            camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-        else:
-            seen = unit_cube.optical_from_cube(body)
-            camera = unit_cube.camera(options.width or unit_cube.THESIS_PIXELS, options.height)
-        width, height = camera.width, camera.height
-        if width * height > MOST_PIXELS or max(width, height) > _LONGEST:  # nor would any command read it
-            expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {_LONGEST}"
-            return misused(f"{expected}, got {width} x {height}")
+        seen = body if pinhole else unit_cube.optical_from_cube(body)
+        camera = _camera(options)
     except ValueError as error:
         return misused(str(error))
+    width, height = camera.width, camera.height
+    if width * height > MOST_PIXELS or max(width, height) > _LONGEST:  # nor would any command read it
+        expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {_LONGEST}"
+        return misused(f"{expected}, got {width} x {height}")
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
         complain("the camera does not see the body: the image is empty")
     _write_depth(output, depth, index, camera, body)
     return SUCCESS
+
+
+def _camera(options: argparse.Namespace) -> Camera:
+    from sq_perception.imaging import unit_cube
+    from sq_perception.imaging.camera import Camera
+
+    if options.projection != "pinhole":
+        return unit_cube.camera(options.width or unit_cube.THESIS_PIXELS, options.height)
+    width, height = options.width or 640, options.height or 480
+    focal = 525.0 if options.focal is None else options.focal
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def _write_depth(output: Path, depth: np.ndarray, index: np.ndarray, camera: Camera, body: Superquadric) -> None:

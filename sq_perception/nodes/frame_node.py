@@ -204,19 +204,22 @@ class FrameNode(ManagedNode):
                     return
                 outcome = Outcome(False, f"{type(error).__name__}: {error}")
                 self._note_defect(outcome.text)
-            if arrival is None:
-                continue
-            was_wanted = self._is_wanted()
-            if outcome is None:
-                self._statistics.count("dropped")
-            else:
-                if not outcome.is_answered:
-                    self._statistics.refuse(outcome.text)
-                    self.get_logger().warning(f"refused a frame: {outcome.text}", throttle_duration_sec=THROTTLE)
-                self._resolve(outcome, arrival.time)
-            if not was_wanted:
-                with self._publishing:
-                    self._outputs.hide()
+            if arrival is not None:
+                self._conclude(arrival, outcome)
+
+    def _conclude(self, arrival: Arrival, outcome: Outcome | None) -> None:
+        """Count a frame by its outcome, None where it was dropped, and answer who waits for one."""
+        was_wanted = self._is_wanted()
+        if outcome is None:
+            self._statistics.count("dropped")
+        else:
+            if not outcome.is_answered:
+                self._statistics.refuse(outcome.text)
+                self.get_logger().warning(f"refused a frame: {outcome.text}", throttle_duration_sec=THROTTLE)
+            self._resolve(outcome, arrival.time)
+        if not was_wanted:
+            with self._publishing:
+                self._outputs.hide()
 
     def _is_wanted(self) -> bool:
         """Whether frames are processed, or one is asked for."""

@@ -81,8 +81,8 @@ class Statistics:
             recent = [(time, what) for time, what in self._recent if time >= now - SECONDS]
             stages = [took for time, took in self._stages if time >= now - SECONDS]
             last_error, last_answer = self._last_error, self._last_answer
-        number = Counter(what for _, what in recent)
-        rate = number["answered"] / min(SECONDS, max(now - self._started, 1.0))
+        recently = Counter(what for _, what in recent)
+        rate = recently["answered"] / min(SECONDS, max(now - self._started, 1.0))
         came = [time for time, what in recent if what == "received" and time > self._stood]
         since = now - min(came, default=now)
         (before, known), self._reported = self._reported, (counts, lost)
@@ -92,7 +92,7 @@ class Statistics:
             self._stood = now
         elif counts["refused"] > before["refused"]:
             message = f"refused a frame: {last_error.partition(' ')[2]}"
-        elif since > _SLOW and not number["answered"]:
+        elif since > _SLOW and not recently["answered"]:
             message = f"{len(came)} frames came within {since:.0f} s, none was answered"
         elif new := lost - known:
             parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())
