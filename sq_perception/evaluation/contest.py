@@ -41,12 +41,12 @@ from sq_perception.segmentation import segments
 
 TIMED_IMAGES = 300
 _NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
-"""Stands where nothing was recovered: outside of the cube."""
+"""Stands in for a body where nothing was recovered; it is outside of the cube."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answers:
-    """What was made of n images.
+    """What a contestant recovered from n images.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class Contestant:
         return truth.canonical_form() if self.has_canonical_labels else truth
 
     def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
-        """What is compared with the labels: the prediction, with whatever was given to the contestant."""
+        """The prediction as it is compared with the labels, from which it takes whatever its loss was given."""
         return Objective(self.loss).with_given(prediction, labels) if self.loss else prediction
 
 

@@ -92,5 +92,5 @@ class FitOptions:
             raise ValueError(f"time_budget: expected positive seconds, got {self.time_budget}")
 
     def predicted_hull(self) -> HullPrior | None:
-        """What :attr:`hull` holds, or returns."""
+        """The hull that :attr:`hull` is, or returns if it is a function."""
         return self.hull() if callable(self.hull) else self.hull

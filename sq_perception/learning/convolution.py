@@ -127,7 +127,7 @@ class _Tiled:
     def computed(
         self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
     ) -> np.ndarray:
-        """As by :class:`Direct`."""
+        """As :meth:`Direct.computed`."""
         squares, inputs, outputs = self.matrices.shape
         size = math.isqrt(squares)
         out = memory.framed(name, len(x), side, outputs)

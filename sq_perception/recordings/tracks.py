@@ -18,7 +18,7 @@ INTERVAL = 0.1
 
 
 def sequence_of(file: str, frame: RecordedFrame) -> tuple[str, str]:
-    """What the frames of a sequence have in common; ``file`` is the frame's source."""
+    """A key that the frames of one sequence share: their bag and topic, or their folder; ``file`` is the source."""
     return (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
 
 
@@ -33,7 +33,7 @@ class RecordedTracks:
         self._warned = False
 
     def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> tuple[Followed, ...]:
-        """What is known of the track of each body that did not fail, in their order; ``file`` is the frame's source."""
+        """Each body that did not fail, in their order, as its track knows it; ``file`` is the frame's source."""
         sequence = sequence_of(file, frame)
         if sequence != self._sequence:
             self._session.reset()

@@ -82,14 +82,14 @@ _ALIKE = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Repeated:
-    """What a frame repeats.
+    """What a frame repeats of the frame before.
 
     Attributes
     ----------
     bodies
-        By their label in the frame before.
+        Bodies that still hold, by their label in the frame before.
     reference
-        That of the frame before, a frame older, where its segments repeat; None where they have to be found.
+        The reference of the frame before, a frame older, where its segments repeat; None where they have to be found.
     """
 
     bodies: Mapping[int, Recovery]
@@ -106,7 +106,7 @@ def repeated(
     options: RecoveryOptions,
     labels: np.ndarray | None = None,
 ) -> Repeated:
-    """Which bodies of the frame before stand for an image, and whether its segments do; nothing without such a frame.
+    """The bodies and segments of the frame before that hold for an image; nothing without such a frame.
 
     Parameters
     ----------
@@ -192,7 +192,10 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
 
 
 def sampled(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
-    """What is compared, float32, of an image (height, width) that is NaN where nothing was measured, and its stride."""
+    """The readings of an image (height, width) that are compared, float32, and their stride in pixels.
+
+    The image is NaN where nothing was measured, the readings are 0 there.
+    """
     stride = max(1, round(camera.width / _WIDTH))
     seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
     return np.where(np.isnan(seen), np.float32(0), seen), stride

@@ -320,10 +320,10 @@ def _join(labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
 
 
 def _unclaimed(labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """What is left by strays and by segments that are not kept, in large pieces: labels (height, width) in which each
-    has a new one, and these new ones.
+    """Labels (height, width) with a new one for each large piece that no object claims, and these new ones.
 
-    A piece that is nearly all of a segment that is not kept is left out, as the network has been asked about it.
+    Pieces are of the strays and of the segments that are not kept.  One that is nearly all of such a segment gets none,
+    as the network has been asked about it.
     """
     nothing = np.ones(int(labels.max()) + 1, np.int32)
     nothing[[0, *kept]] = 0

@@ -75,14 +75,14 @@ class Recoverer:
         Weights file; None: the ones that ship with the package, ``things`` for what ``auto`` fits to images of pinhole
         cameras, as it predicts hulls with their uncertainty, and ``robust``, which predicts bodies, for all else.
     device
-        Of the network: "cpu", "cuda" ...
+        Where the network computes: "cpu", "cuda" ...
     method
         What :meth:`recover` does unless its options say otherwise.  "symmetry" and "classic" load no network; if a
         later call asks for one, it is loaded then.
     threads
         How many objects of a frame are worked on at the same time; None: as many as this process has cores.
     weights_of
-        One whose loaded weights are taken, if it has any; the file is not read then.
+        Another recoverer, whose loaded weights are taken if it has any; the file is not read then.
 
     Raises
     ------
@@ -121,7 +121,7 @@ class Recoverer:
             self._load_masks()
 
     def _begin(self) -> None:
-        """Threads, and what they wait for, of this process."""
+        """Make the threads and the lock of this process."""
         self._process = os.getpid()
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")

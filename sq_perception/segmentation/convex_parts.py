@@ -140,7 +140,7 @@ def _rims(image: SampledImage) -> np.ndarray:
 
 
 def _insides(image: SampledImage, rims: np.ndarray, parts: list[Samples], origin: list[int]) -> list[tuple[int, int]]:
-    """Those pairs of :func:`_rims`, an inside and its wall, of which the first is the inside of a vessel.
+    """The pairs of :func:`_rims`, an inside and its wall, that are of a vessel.
 
     The inside of a vessel is a segment that was not parted and whose surface lies behind its own lines.
     """
@@ -225,8 +225,10 @@ def _crossed_between(
 def _go_on(
     image: SampledImage, names: np.ndarray, together: tuple[np.ndarray, np.ndarray, np.ndarray], wanted: np.ndarray
 ) -> np.ndarray:
-    """Which of ``wanted`` pairs of segments, bool (n, n), go on behind something nearer; of their labels (n,), and
-    samples as by :func:`_together`."""
+    """Which of ``wanted`` pairs of segments, bool (n, n), are one surface that goes on behind something nearer.
+
+    ``names`` are the labels (n,) of the segments, ``together`` their samples as by :func:`_together`.
+    """
     along, over = crossings.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
     return np.asarray(wanted & (along > _ALONG) & (over < AS_ONE))
 

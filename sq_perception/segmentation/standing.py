@@ -84,18 +84,18 @@ shows one more that is none."""
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What an image of a pinhole camera shows.
+    """An image of a pinhole camera, and what is known of its planes.
 
     Attributes
     ----------
     depth : float32 (height, width)
         Metres, 0 where nothing was measured.
-    known
-        The same, 0 also where objects are not looked for.
+    known : float32 (height, width)
+        ``depth``, 0 also where objects are not looked for.
     walls
         Planes that are no support.
     options
-        What objects may be.
+        What counts as an object.
     """
 
     depth: np.ndarray
@@ -132,7 +132,7 @@ def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
 
 
 def _of_no_segments(seen: Seen, labels: np.ndarray) -> list[Plane]:
-    """Those of the walls whose points are mostly in no segment.
+    """The walls whose points are mostly in no segment.
 
     The tops or the fronts of equal things lie in one plane, too, and most of its points are in segments.  Surfaces that
     are larger than a thing are in none (:func:`furniture`).
@@ -251,7 +251,7 @@ def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
 
 
 def _noise(heights: np.ndarray, base: float, top: float) -> np.ndarray:
-    """Those of the heights (n,) beside a thing that tell of noise about a base.
+    """The heights (n,) beside a thing that tell of noise about a base.
 
     Below the base there is nothing but noise, above it there may be low things or a wall behind.  So the heights below
     tell of it alone, if there are enough, for a thing that is higher than a support is ever seen raised.

@@ -401,10 +401,10 @@ def _lie_on(plane: Plane, points: np.ndarray) -> np.ndarray:
 
 
 def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], list[float], float]:
-    """What the points (n, 3) that lie on none of some planes tell of each plane, and their share of all points.
+    """How well each of some planes explains the points that lie on none of them, by two measures, and their share.
 
-    First the share of them that is as close above the plane as what stands on a support, then how near to it they are,
-    0 to 1.
+    First the share of these points that is as close above the plane as what stands on a support, then how near above it
+    they are, 0 to 1.  ``points`` (n, 3) are all of the image.
     """
     heights = np.stack([plane.height(points) for plane in candidates])
     rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]

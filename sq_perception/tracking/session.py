@@ -44,7 +44,7 @@ class Followed:
     Attributes
     ----------
     id
-        Of its track.
+        The id of its track.
     seen
         Number of frames that showed the body, this one included.
     is_fused
@@ -184,7 +184,10 @@ class TrackingSession:
 
 
 def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
-    """What was observed with the axes named as those of a body with this covariance, and its own covariance."""
+    """The observed body and its covariance, in that of its equivalent forms which continues ``body``.
+
+    ``covariance`` (11, 11) is that of ``body``.
+    """
     own = np.asarray(observation.covariance, dtype=float)
     known = np.isfinite(own).all()
     found, changed = forms.named(
