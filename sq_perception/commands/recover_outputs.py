@@ -81,7 +81,7 @@ class Outputs:
     done : list
         Elements of ``frames`` that the file of lines had at the beginning.
     results : list
-        Those of this run.
+        Elements of ``frames`` that this run adds.
 
     Raises
     ------

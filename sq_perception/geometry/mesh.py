@@ -138,7 +138,7 @@ def export(
     colours : (n, 3), optional
         Red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.
     names : (n,), optional
-        Of the nodes of a GLB; body_0, body_1 ... if not given.
+        Names of the nodes of a GLB; body_0, body_1 ... if not given.
     optical : bool
         The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x
         so that viewers show it upright.  A PLY always keeps the coordinates.

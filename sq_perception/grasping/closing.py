@@ -58,7 +58,7 @@ class KnownBodies:
     flat, turns : (n, 12), (n, 3, 3)
         Flat parameters and rotation matrices.
     covariance : (n, 9, 9)
-        Of sizes, centre and turn.
+        Covariances of sizes, centre and turn.
     """
 
     flat: np.ndarray

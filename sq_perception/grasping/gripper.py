@@ -38,7 +38,7 @@ class Gripper:
     Attributes
     ----------
     opening
-        Between the pads, at most.
+        The largest distance between the pads.
     finger_width, finger_thickness
         Along x and along y.
     tip, palm
@@ -46,13 +46,13 @@ class Gripper:
     hand : (3,)
         Full sizes of the box behind the palm.
     force
-        Of one finger when it holds.
+        The force of one finger when it holds.
     link
         The link of the gripper's model that the pose of the TCP is given in.
     link_from_tcp : (3,), (4,)
         Position and quaternion x y z w of the TCP in that link: p_link = R p_tcp + t.
     joints
-        Those of the fingers in that model, each of which moves by half of the opening; none where fingers turn.
+        The fingers' joints in that model, each of which moves by half of the opening; none where fingers turn.
 
     Raises
     ------

@@ -21,11 +21,11 @@ class Grasp:
     body
         Position of its body in the batch.
     position, rotation : (3,), (4,)
-        Of the TCP, a quaternion x y z w, in the frame of the bodies.
+        Pose of the TCP in the frame of the bodies; the rotation is a quaternion x y z w.
     opening
-        Of the fingers before they close.
+        Distance between the fingers before they close.
     width
-        Of the body between them.
+        Width of the body between them.
     score
         Probability that it holds.
     weakest

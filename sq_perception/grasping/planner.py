@@ -60,7 +60,7 @@ from sq_perception.grasping.trials import (
 from sq_perception.imaging.camera import Camera
 
 FRICTION = 0.5
-"""Of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
+"""Coefficient of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
 _AT_MOST = 2.0
 """Times the least friction."""
 PER_BODY = 8
@@ -76,7 +76,7 @@ _CLEAR = 0.95
 _CHECKED, _CHECKED_CLOSELY = 40, 16
 """Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
 _CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
-"""The same of bodies whose best grasp is then less probable than that."""
+"""Grasps looked at of a body whose best one is less probable than that after the first ones."""
 _LEAST = 0.05
 """Grasps less probable than that are not returned."""
 

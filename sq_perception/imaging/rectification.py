@@ -125,7 +125,7 @@ class Lookup:
     Attributes
     ----------
     source : Camera
-        Of the images that are looked up in; others raise ValueError.
+        Camera of the images that are looked up in; others raise ValueError.
     u, v : float32 (height, width)
         Column and row in the source, far outside of it where it does not see the pixel.
     left, top : float32 (height, width)

@@ -56,7 +56,7 @@ class Subject(Generic[Network, Views]):
     """What is particular to a network that is trained on shards."""
 
     name: str
-    """Of its file of weights and of its command, ``train-NAME``."""
+    """Name of its file of weights and of its command, ``train-NAME``."""
     none: Views
     """No views at all, in the form of all."""
     network: Callable[[str], Network]
@@ -64,7 +64,7 @@ class Subject(Generic[Network, Views]):
     batch: Callable[[Views, np.ndarray, np.random.Generator], tuple[torch.Tensor, ...]]
     """What the network takes of the views of these numbers, varied at random, and last the truth about them."""
     loss: Callable[..., torch.Tensor]
-    """Of the network's output for a batch, and of that batch."""
+    """Loss of the network's output for a batch, and of that batch."""
     validate: Callable[[Network, Views], dict[str, Any]]
     """Figures of the network on views."""
     finish: Callable[[Network, Views], None] | None = None

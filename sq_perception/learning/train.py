@@ -78,7 +78,7 @@ def train(
     config
         The run.
     output
-        Its folder.
+        The folder of the run.
     network
         A form other than that of ``config``.
     advance

@@ -78,7 +78,7 @@ class Turns:
 
 
 TURNS = Turns()
-"""Those of this process."""
+"""The turns of this process."""
 _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
 _making = threading.Lock()
 

@@ -85,7 +85,7 @@ class Outputs:
         self._publishers: tuple[Publisher, ...] = ()
         self._marker_ids = MarkerIds()
         self._header: Any = None
-        """That of the markers that are shown, if there are any."""
+        """Header of the markers that are shown, if there are any."""
 
     def open(self, parameters: RecoverParameters) -> None:
         """Create what is published."""

@@ -68,7 +68,7 @@ class ViewNode(Node):
         Topics, resolved and remapped as those of a node are.  Without a camera_info that is named or remapped, the one
         in the name space of the images.
     rate
-        Of drawing, Hz, at most.
+        How often the page is drawn, Hz, at most.
     """
 
     def __init__(

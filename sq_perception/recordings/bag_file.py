@@ -93,7 +93,7 @@ class InputOptions:
     projection
         "pinhole" or "orthographic", which looks for grey images of the unit cube in bags.
     topic
-        Of the images in bags; needed where several show depth.
+        Topic of the images in bags; needed where several show depth.
     every, limit
         Of each folder and bag: every n-th frame only, and at most so many.
     distortion
@@ -129,7 +129,7 @@ class RecordedBag:
     Parameters
     ----------
     path
-        Of the folder or file.
+        The bag, a folder or file.
     options
         All of its images by default.
     is_done

@@ -52,7 +52,7 @@ class Identified:
     Attributes
     ----------
     ids
-        Of each object.
+        The id of each object.
     hidden
         Ids of tracks that the frame does not show.
     columns

@@ -149,9 +149,9 @@ class ResultLines:
     Parameters
     ----------
     path
-        Of the file.  A device or FIFO is written to as it is.
+        The file.  A device or FIFO is written to as it is.
     options
-        Those that decide what is found.
+        The options that decide what is found.
 
     Attributes
     ----------

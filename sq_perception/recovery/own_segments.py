@@ -41,32 +41,36 @@ from sq_perception.segmentation import convex_parts, pieces, segments
 from sq_perception.segmentation.segments import Segmentation
 
 _ONE = 0.45
-"""Of 884 simulated things 0.4, 0.45 and 0.5 miss 59, 57 and 57, and leave 61, 69 and 74 bodies of none, or of parts; of
-780 superquadrics in crowds they miss 32, 30 and 30."""
+"""Segments are joined above it.  Of 884 simulated things 0.4, 0.45 and 0.5 miss 59, 57 and 57, and leave 61, 69 and 74
+bodies of none, or of parts; of 780 superquadrics in crowds they miss 32, 30 and 30."""
 _PIECES = 4
-"""Of a segment.  Each should show one thing, and enough of it to tell things apart."""
+"""Pieces of a segment.  Each should show one thing, and enough of it to tell things apart."""
 _SURE = 0.85
-"""With 0.9 half as many segments again are asked about, and of 342 simulated and recorded frames one has one more
-segment, of nothing; with 0.8 one of 52 recorded things is left in its neighbour."""
+"""A segment is parted only if a piece of it claims less.  With 0.9 half as many segments again are asked about, and of
+342 simulated and recorded frames one has one more segment, of nothing; with 0.8 one of 52 recorded things is left in
+its neighbour."""
 _APART = 0.3
-"""Of the same things 0.2, 0.3 and 0.4 miss 57 each, and leave 70, 69 and 71 bodies of none, or of parts."""
+"""Pieces that claim less of each other are of two objects.  Of the 884 things 0.2, 0.3 and 0.4 miss 57 each, and leave
+70, 69 and 71 bodies of none, or of parts."""
 _ITSELF = 0.5
 """A piece that claims less of itself shows no object: what a sensor smeared, or several things."""
 _LEAST_TO_PART = 60
-"""Cells of a segment: of 15 in a piece."""
+"""Cells of a segment that may be parted: 15 in a piece."""
 _LEAST_CELLS = 4
-"""Of another segment in a view, for a mean."""
+"""Cells that another segment has in a view at least, for a mean over them."""
 _OF_AN_OBJECT = 1 / 3
-"""Of 599 segments of things, simulated and recorded, 593 have more, of 162 simulated ones of none 21."""
+"""Share of a segment's pixels that are of an object.  Of 599 segments of things, simulated and recorded, 593 have more,
+of 162 simulated ones of none 21."""
 _MOST_STRAYS = 0.5
 """Share of a segment beyond which the network contradicts itself, as the object is what most of the segment shows: the
 segment keeps its pixels, if it is not dropped."""
 _ROUNDS = 3
-"""Of joining: eight pieces may become one."""
+"""Rounds of joining: eight pieces may become one."""
 _ITSELF_AFTER_ALL = 0.75
-"""The same of what was disowned before.  Of 2507 simulated things on tables, in rooms, furniture and crowds 226 are
-missed without a second look and 216 with it, and 204 and 209 segments are none of a thing.  53 pieces that it found to
-be things, in 2600 other scenes, all claim more than this, of 12 that were none 4 claim less."""
+"""A piece of what was left claims at least so much of itself, to be an object after all.  Of 2507 simulated things on
+tables, in rooms, furniture and crowds 226 are missed without a second look and 216 with it, and 204 and 209 segments
+are none of a thing.  53 pieces that it found to be things, in 2600 other scenes, all claim more than this, of 12 that
+were none 4 claim less."""
 _BRUSH = np.ones((7, 7), np.uint8)
 """Pixels; what is left along edges is thinner.  With 3 x 3 212 of them are missed, and on 14 recorded frames a second
 look adds 6 bodies of nothing to the 30 that there are without; with this 1."""
@@ -102,7 +106,7 @@ class SegmentNetwork:
     Attributes
     ----------
     network
-        Of masks.
+        The network of masks.
     depth : float (height, width)
         Metres, not finite or 0 where nothing was measured; every segment has a reading.
     plane : (4,) or None

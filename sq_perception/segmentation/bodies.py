@@ -24,7 +24,7 @@ LEAST_SIGMA = 5e-4
 _FOOT_PIXELS = 3
 """Up to which the foot of a thing reaches below what is clearly above the support."""
 _LEAST_AREA = 1e-4
-"""Of a component without a step in it, square metres across the line of sight."""
+"""Least area of a component without a step in it, square metres across the line of sight."""
 _MOST = 100
 """Components; bounds the time of frames that are noise alone."""
 _GROWN = 3

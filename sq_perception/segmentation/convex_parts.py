@@ -46,8 +46,8 @@ _RIM = 0.12
 """Share of an inside's border that lies behind another segment, and of the border of that: of 12 recorded bowls, pots
 and mugs 0.13 and more of both, of 31 of 33 simulated insides beside a nearer thing that is not theirs less of one."""
 _BIT_AS_ONE = 0.45
-"""Of a bit, which is too small to be a body beside one, and what it is beside, a smaller share of crossed pairs is one
-body: handles and what noise broke off.  Of 2507 simulated things as many are missed as with 0.3, and 181 segments are
+"""Share of crossed pairs below which a bit, too small to be a body beside one, is one body with what it is beside:
+handles and what noise broke off.  Of 2507 simulated things as many are missed as with 0.3, and 181 segments are
 none of a thing, not 189; with 0.55 low things beside tall ones are lost."""
 _OF_RIM = 0.1
 """Share of that border at which a piece of the other segment is a part of the wall: noise may take a wall apart, and

@@ -15,16 +15,16 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.imaging.depth_steps import STEP
 
 _STEPS = 16
-"""In which a line is walked: gaps between round things that touch are narrow.  Of 884 simulated things own masks miss
-48; with 8 steps 57, with 24 49."""
+"""Steps in which a line is walked: gaps between round things that touch are narrow.  Of 884 simulated things own masks
+miss 48; with 8 steps 57, with 24 49."""
 _FINE_STEPS = 24
-"""The same of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
+"""Steps of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
 _FEWEST_LINES = 60
-"""Of which one passes behind something, if many of a pair do."""
+"""After so many lines of a pair of which none passes behind something, no more are walked."""
 _LOOKS = 8
-"""At a line, for the mean gap behind it: it changes little where there are more."""
+"""Parts of a line, between which the gap behind it is looked at: its mean changes little where there are more."""
 _SHARE = 0.01
-"""Of the depth, that something lies behind a line at least."""
+"""Share of the depth beyond which the least distance behind a line does not go."""
 _HOME = 0.1
 """A pixel leaves the part of its nearest sample only if another one's lines are so much freer."""
 

@@ -40,9 +40,9 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
     Parameters
     ----------
     points
-        Of each segment (n, 3), evenly taken.
+        Points (n, 3) of each segment, evenly taken.
     plane : (4,)
-        What they stand on.
+        The plane that they stand on.
     """
     if len(points) < 3:
         return set()

@@ -28,9 +28,9 @@ from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_gro
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
 _SAMPLES, _FEWEST = 400, 30
-"""Of a segment, evenly taken, and least of a face of it: of an upright side 11 cm high 29 lie within a tolerance of one
-height.
-With twice as many of both, 30 instead of 32 of 289 simulated things on cartons and stools are missed."""
+"""Samples of a segment, evenly taken, and the fewest of a face of it: of an upright side 11 cm high 29 lie within a
+tolerance of one height.  With twice as many of both, 30 instead of 32 of 289 simulated things on cartons and stools are
+missed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +75,7 @@ def found(
     Parameters
     ----------
     segments
-        Of the image, as :func:`samples`.
+        Samples of the segments of the image, as :func:`samples` gives them.
     labels : int32 (height, width)
         Segments from 1.
     depth : (height, width)

@@ -19,7 +19,7 @@ Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
 EVERYTHING = (0.0, np.inf)
 """Range of all depths, metres."""
 _SAMPLES = 400
-"""Of a segment, evenly taken: the 1 % that may stick out are a few still."""
+"""Pixels of a segment, evenly taken: the 1 % that may stick out are a few still."""
 _OUTLIERS = 0.01
 """Share of the points at either end that do not count for the extent: sensors smear edges."""
 TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)

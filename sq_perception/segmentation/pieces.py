@@ -11,7 +11,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 
 _STEPS = 2
-"""Of the centres; then no piece is a sliver at an end."""
+"""Steps of the centres; then no piece is a sliver at an end."""
 
 
 def compact(cells: np.ndarray, count: int, place: tuple[float, float]) -> np.ndarray:

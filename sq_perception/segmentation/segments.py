@@ -44,7 +44,8 @@ from sq_perception.segmentation import (
 from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
-"""Of an object: pixels, and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits of noise."""
+"""What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits
+of noise."""
 _UNKNOWN_SIGMA = 1.5e-3
 """Noise of the depth at one metre where no support shows it, metres: that of structured light (Khoshelham and Oude
 Elberink, Sensors 2012)."""

@@ -36,13 +36,13 @@ from sq_perception.segmentation.support_plane import (
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
-"""Of the rows and columns of a segment's pixels."""
+"""Whether a segment is an object, by the rows and columns of its pixels."""
 
 MIN_HEIGHT, _LEAST_HEIGHT = 0.012, 0.008
 """Metres that a thing reaches above the support at least, a metre away and farther, and nearer as the noise falls: one
 and a half tolerances of a plane, and a book's thickness, as cloths have folds."""
 _SAMPLES = 400
-"""Of a segment, evenly taken: the 5 % above a height are a few still."""
+"""Pixels of a segment, evenly taken: the 5 % above a height are a few still."""
 _SPARSE, _STRAY = 8, 0.001
 """Every so many pixels tell the nearest depth of an image, but for that share of them, which may be stray readings."""
 _FEWEST = 30
@@ -55,8 +55,8 @@ _LOWER_SIDE = 0.1
 """Share of the heights beside a thing, at least, that tell the noise from below.  Of 25 simulated things that were
 missed it finds two, 0.25 none."""
 _WAVE = 0.5
-"""Of what the support beside a thing lies lower than the base, that counts as a deviation: a thing is three times as
-high.  It changes nothing in 288 simulated scenes, and finds two things in 34 recorded frames."""
+"""Share of what the support beside a thing lies lower than the base, that counts as a deviation: a thing is three times
+as high.  It changes nothing in 288 simulated scenes, and finds two things in 34 recorded frames."""
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _IN_SEGMENTS = 0.5

@@ -33,12 +33,13 @@ from sq_perception.imaging.camera import Camera
 TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
 _LEAST_SHARE = 0.1
-"""Of the valid pixels that a plane has."""
+"""Share of the valid pixels that a plane has at least."""
 _LEAST_BEFORE_WALL, _FRONTAL = 0.03, 0.3
-"""The same where only planes were found that face the camera, to whose normals the image's vertical has at most that
-cosine: before a wall a low camera sees little of a table.  What faces the camera too is the front of a thing."""
+"""That share where only planes were found that face the camera, and the cosine between their normals and the image's
+vertical at most: before a wall a low camera sees little of a table.  What faces the camera too is the front of a
+thing."""
 _SEED = 0
-"""Of the random sample; the same image gives the same planes."""
+"""Seed of the random samples; the same image gives the same planes."""
 _PLANE_POINTS, _REFINE_POINTS = 1500, 8000
 """On so many points planes are counted, and the best one is fitted: a share of a tenth is then known to 8 % of itself,
 and a height to a hundredth of the noise."""
@@ -56,8 +57,8 @@ _APART = 2
 _COARSE_PIXELS = 120
 """Samples along the shorter side of the image that surfaces are searched on."""
 _ISLAND_SHARE = 0.25
-"""Of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of it.
-Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
+"""Share of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of
+it.  Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
 LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
 shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
@@ -100,9 +101,9 @@ class Plane:
     equation : (4,)
         n and d, height above it = n.p + d, n towards the camera.
     share
-        Of the image's points that lie on it.
+        Share of the image's points that lie on it.
     sigma
-        Of their heights at a depth of one metre, metres.
+        Standard deviation of their heights at a depth of one metre, metres.
     """
 
     equation: np.ndarray

@@ -42,9 +42,9 @@ from sq_perception.segmentation.support_plane import (
 )
 
 _ROUNDS = 6
-"""Of reweighting, at most: it ends when it is settled."""
+"""Rounds of reweighting, at most: it ends when it is settled."""
 _TERMS = 6
-"""Of a quadratic surface."""
+"""Coefficients of a quadratic surface."""
 _DISTORTION = 0.02
 """Makers of depth cameras promise an error of at most 2 % of the depth."""
 _GAIN = 1.05
@@ -75,13 +75,13 @@ class SupportSurface:
     Attributes
     ----------
     plane
-        With the noise about it.
+        The support plane, with the noise about it.
     bend : (6,)
-        Of the height at one metre, by 1, x, y, x^2, x y and y^2.
+        Coefficients of the height at one metre, by 1, x, y, x^2, x y and y^2.
     limit
-        Of the bend, metres at one metre.
+        The most that the surface bends, metres at one metre.
     sigma
-        Of the heights above the bent surface at a depth of one metre, metres.
+        Standard deviation of the heights above the bent surface at a depth of one metre, metres.
     """
 
     plane: Plane

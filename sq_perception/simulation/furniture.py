@@ -46,7 +46,7 @@ class _Place:
     half : (2,)
         Half its sides.
     height
-        Of the highest thing.
+        Height of the highest thing, metres.
     """
 
     axes: np.ndarray

@@ -75,7 +75,7 @@ class SegmentViews:
     Attributes
     ----------
     images : float16 (n, p, p, CHANNELS)
-        Of :class:`~sq_perception.imaging.segment_view.SegmentView`.
+        As in :class:`~sq_perception.imaging.segment_view.SegmentView`.
     truth : uint8 (n, p, p)
         Whether the cell's reading is one of the object: NO, YES, or UNKNOWN where there is none.
     """

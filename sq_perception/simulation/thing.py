@@ -66,7 +66,7 @@ class Thing:
     parts : Superquadric
         Batch (k,) in the thing's own frame, metres.
     rests : tuple of Rest
-        Their probabilities add up to 1.
+        How it may lie; their probabilities add up to 1.
     cavities : Superquadric
         Batch (m,), m >= 0: what is cut away from the union.
     surface : Mesh, optional

@@ -47,7 +47,7 @@ class Setting:
     Attributes
     ----------
     parts, cavities : Superquadric
-        Of the thing, (k,) and (m,).
+        The thing's own, batches (k,) and (m,).
     others : Superquadric
         Batch (j,), j >= 0: neighbours, and what it stands on.
     table : (4,) or None
@@ -56,9 +56,9 @@ class Setting:
         Depth of the wall behind all, +inf without one.
     camera : Camera
     surface : Mesh, optional
-        Of the thing, if it is seen as one.
+        The thing's surface, if it is seen as a mesh.
     height
-        Above the table, of what the thing stands on.
+        Height above the table of what the thing stands on, metres.
     """
 
     parts: Superquadric

@@ -36,11 +36,11 @@ class Triangulation(SensorNoise):
     Attributes
     ----------
     focal : pixels
-        At which disparities are measured.
+        Focal length by which disparities are measured.
     baseline : metres
         x of the projector or second imager; positive is to the right of the camera, seen by the camera.
     step : pixels
-        Of disparity; 0 does not round.
+        Step that disparities are rounded to; 0 does not round.
     window : (columns, rows)
         Odd numbers of pixels that one reading looks at.
     near, far : metres

@@ -47,7 +47,7 @@ class Occluder(NamedTuple):
         Angle of u, radians from the view's x axis.
     bow, offset, power, thickness : (n,)
     share : (n,)
-        Of the body's own pixels, 0 to below 1; 0 is no occluder.
+        Share of the body's own pixels that is hidden, 0 to below 1; 0 is no occluder.
     """
 
     direction: np.ndarray

@@ -88,7 +88,7 @@ class Body:
     Attributes
     ----------
     id
-        Of the track.
+        The id of the track.
     state : (12,)
     covariance : (11, 11)
         P, without ``lasting``.

@@ -65,7 +65,7 @@ _RESTART = 3.0
 """A restarted pose is unsure by this many times the displacement.  Chosen."""
 _Bodies = tuple[Body, ...]
 _Expected = Callable[[Sequence[Body]], np.ndarray]
-"""Of bodies that were not seen (n,), whether they should have been, bool (n,)."""
+"""Whether n bodies that were not seen should have been, bool (n,)."""
 
 
 class Tracker:

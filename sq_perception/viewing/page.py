@@ -54,11 +54,11 @@ class Page:
     Parameters
     ----------
     bound
-        Of :func:`sq_perception.viewing.server.listening_socket`.
+        A socket of :func:`sq_perception.viewing.server.listening_socket`.
     nodes
         Fully qualified names.
     most_points
-        Of the cloud.
+        The most points of the cloud that are drawn.
     parameters
         Whether the nodes have any, so that there is a place for them.
 

@@ -48,7 +48,7 @@ class Scene:
     Attributes
     ----------
     camera : Camera or None
-        Of the last depth image.
+        Camera of the last depth image.
     """
 
     def __init__(self, server: PageServer, has_one_node: bool) -> None:
