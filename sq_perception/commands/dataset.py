@@ -17,7 +17,7 @@ examples:
   sq-perception dataset sets/views --pixels 64 --train 50000 --test 2000
 """
 _FULL_PIXELS, _PIXELS = 256, 64
-"""Of the thesis' images, and of the views of the shipped networks."""
+"""Pixels a side of the thesis' images, and of the views of the shipped networks."""
 
 
 def main(arguments: Sequence[str]) -> int:

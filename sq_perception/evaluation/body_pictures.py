@@ -25,7 +25,7 @@ from sq_perception.imaging.camera import Camera
 _LIGHT = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
 """Towards the light, in the frame of the picture: from the upper left, in front."""
 _MOST_POINTS = 1500
-"""Of the cloud of one body."""
+"""Points that are drawn of the cloud of one body."""
 
 
 def draw_bodies_3d(

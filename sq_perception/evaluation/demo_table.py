@@ -22,7 +22,7 @@ from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 
 TITLES = {"recover_node": "CNN + fit", "fitter_node": "classic fit"}
-"""Of the methods, by the node."""
+"""Titles of the methods, by the node."""
 _GOOD_OVERLAP = 0.9
 """IoU of a body that is shown in green."""
 _POINTS = 48

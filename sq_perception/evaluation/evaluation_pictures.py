@@ -27,7 +27,7 @@ _GRID = "#dfe5ea"
 _EACH = 3
 _ARC_BINS = np.linspace(0, 360, 121)
 _BINS = np.linspace(0, 100, 101)
-"""Of IoU in per cent and of angles in degrees."""
+"""Edges of bins for IoU in per cent and for angles in degrees."""
 _CLOSE_IOU_BINS = np.linspace(95, 100, 101)
 """Where every body is this good."""
 

@@ -17,4 +17,4 @@ BODIES = 20_000
 FIT_BODIES = 2000
 """The first of these for fits, which take some ten times as long."""
 DEFAULT_SEED = 2020
-"""Of the test set."""
+"""Seed of the test set."""

@@ -15,7 +15,7 @@ from typing import Any
 Entry = Mapping[str, Any]
 """A contestant as results.json has it: name, loss (None for fits), and the summary of its figures."""
 NOTHING = "none given"
-"""In the cells of a row of the thesis that no contestant answers."""
+"""What stands in the cells of a row of the thesis that no contestant answers."""
 NOT_IN_THESIS = "not in the thesis"
 
 

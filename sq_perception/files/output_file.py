@@ -26,7 +26,7 @@ from pathlib import Path
 
 _NO_NEW_FILES = (errno.EACCES, errno.EPERM, errno.EROFS)
 _NOT_REPLACED = (errno.EBUSY, errno.EXDEV)
-"""Of a file that is a mount of its own, as containers have them."""
+"""Errors for a file that is a mount of its own, as containers have them."""
 _DESCRIPTORS = "/proc/"
 """Where /dev/stdout, /dev/fd/3 and a shell's >(command) lead."""
 

@@ -22,9 +22,9 @@ import cv2
 import numpy as np
 
 MOST_PIXELS = 2**25
-"""Of an image, or numbers of an array: no depth camera has more."""
+"""Pixels of an image, or numbers of an array: no depth camera has more."""
 MOST_BYTES = 2**28
-"""Of a packed file."""
+"""Bytes of a packed file."""
 
 
 class UnpackingError(ValueError):

@@ -25,7 +25,7 @@ from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
 _TOO_WIDE = 0.8
 """A body that is wider than the opening by so many sigmas of its width is not tried: once in five it would fit."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
-"""Of the approach about the closing line, away from the steepest one."""
+"""Turns of the approach about the closing line, away from the steepest one."""
 _STEEP, _FROM_BELOW = 0.3, -0.1
 """Sines: a closing line is at least so far off the vertical, and no hand comes more upwards than that."""
 _SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])

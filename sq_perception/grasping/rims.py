@@ -35,7 +35,7 @@ from sq_perception.grasping.trials import (
 
 _BEARINGS = np.arange(24) * np.pi / 12
 _INSETS = np.array([0.012, 0.02, 0.03])
-"""Of the fingers' ends below the rim."""
+"""Depths of the fingers' ends below the rim, metres."""
 _BEYOND = 0.015
 """Points so far outside of a body may be its rim."""
 _HIGH, _THIN = 0.006, 0.012
@@ -46,9 +46,10 @@ _UPRIGHT = 0.9
 """Share of rims that held where all other margins were sure: 31 of 35 that scenes of benchmarks/picking.py from
 seed 20000 on, none of which is reported, ended with.  In place of friction: how steep a wall is, is not looked at."""
 _STEEP = np.cos(np.deg2rad(35.0))
-"""Of a body's axis to the vertical: vessels that lean farther have no rim that a hand comes to from above."""
+"""Least cosine of a body's axis to the vertical: vessels that lean farther have no rim that a hand comes to from
+above."""
 _WALLS = 0.3
-"""Of the volume of a vessel: walls of 4 mm of one 8 cm wide and 10 cm high."""
+"""Share of the volume of a vessel that is solid: walls of 4 mm of one 8 cm wide and 10 cm high."""
 
 
 def at_rims(

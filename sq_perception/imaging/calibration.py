@@ -43,7 +43,7 @@ from sq_perception.imaging.rectification import Rectification, rectification
 Treatment = Literal["auto", "apply", "ignore"]
 
 _NEGLIGIBLE = 1e-9
-"""Of a coefficient: a millionth of a pixel."""
+"""A coefficient up to it counts as 0: a millionth of a pixel."""
 _WORDS = re.compile(r"[^0-9a-z]+")
 _RECTIFIED = re.compile(r"rect(ified)?")
 

@@ -16,7 +16,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 
 _SMALLEST_PIECE = 0.02
-"""Of the largest one's pixels."""
+"""Share of the largest one's pixels."""
 _FRINGE = 1 / 3
 """A piece with so many of its pixels, or one across a step with so many of its border's pixels, beside others of its
 depth outside the mask."""

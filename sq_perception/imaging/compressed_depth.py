@@ -28,7 +28,7 @@ TRANSPORT = "compressedDepth"
 _HEADER = struct.Struct("<iff")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IMAGE_HEADER = struct.Struct(">8xI4sIIBB")
-"""Of a PNG: length and name of its first chunk, width, height, bits, colour type (0 is grey)."""
+"""The beginning of a PNG: length and name of its first chunk, width, height, bits, colour type (0 is grey)."""
 _RVL_HEADER = struct.Struct("<II")
 _MILLIMETRES = np.float32(1000.0)
 

@@ -38,7 +38,7 @@ MODELS = (*POLYNOMIAL, FISHEYE)
 
 _LENGTHS = {**dict.fromkeys(POLYNOMIAL, (4, 5, 8, 12, 14)), FISHEYE: (4,)}
 _LARGEST = 1e6
-"""Of a coefficient; whatever is larger is no lens."""
+"""The largest coefficient; whatever is larger is no lens."""
 _WIDEST = math.pi / 2 - 1e-3
 _SAMPLES = 4096
 _STEPS = 20

@@ -13,7 +13,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera, Lens
 
 _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
-"""Of a box, which of its lower and upper x, y and z each is at."""
+"""Corners of a box: which of its lower and upper x, y and z each is at."""
 _NEAR = 1e-6
 """Metres before a pinhole camera, nearer than which a corner says nothing of where a thing is seen."""
 

@@ -45,7 +45,7 @@ LARGEST_SIDE = 2**15 - 2
 _KEPT = 16
 """Calibrations whose tables are kept."""
 _GROWTH = 2.0
-"""Of the number of pixels, at most."""
+"""Factor by which the number of pixels grows, at most."""
 _BORDER = 64
 """Places on each side of the raw image whose rays bound what it sees."""
 _STEEPEST = 10.0

@@ -12,8 +12,8 @@ from sq_perception.imaging.camera import Camera
 _OPEN = 0.1
 """Share of a region's border from which on it is not enclosed by others."""
 _BAND = 0.1
-"""Of a side of an image: the most of it that a band without readings takes along a border; beyond more there is nothing
-to measure.  That of a D435 takes so much of what is 0.25 m away.  Chosen."""
+"""Share of a side of an image: the most of it that a band without readings takes along a border; beyond more there is
+nothing to measure.  That of a D435 takes so much of what is 0.25 m away.  Chosen."""
 
 
 def nearest(wanted: np.ndarray) -> np.ndarray:

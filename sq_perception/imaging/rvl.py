@@ -18,9 +18,9 @@ MOST_PIXELS = 2**23
 """Above any depth camera's; unpacking takes some 100 bytes of memory for each."""
 
 _MOST_BYTES = 4
-"""For each pixel: 17 bits of a difference are 6 nibbles, and a run of one pixel has 2 more."""
+"""Bytes for each pixel: 17 bits of a difference are 6 nibbles, and a run of one pixel has 2 more."""
 _MOST_GROUPS = 9
-"""Of a number: 27 bits, more than the pixels."""
+"""Groups of a number: 27 bits, more than the pixels."""
 
 
 def decode(data: bytes, width: int, height: int) -> np.ndarray:

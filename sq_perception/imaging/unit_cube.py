@@ -20,7 +20,7 @@ from sq_perception.imaging.camera import Camera
 
 THESIS_PIXELS = 256
 POSE = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 1.0)
-"""Of the optical frame in the cube frame: a half turn about x, as a quaternion x y z w, and a translation."""
+"""Pose of the optical frame in the cube frame: a half turn about x, as a quaternion x y z w, and a translation."""
 _HALF_TURN_ABOUT_X, _SHIFT = (np.array(part) for part in POSE)
 
 

@@ -29,7 +29,7 @@ Weights = Mapping[str, np.ndarray]
 """float32, by the names of :mod:`sq_perception.learning.layout`."""
 
 _EPSILON = 1e-5
-"""Of torch's normalisations."""
+"""What torch's normalisations add to a variance."""
 _G = {
     4: np.array([[2, 0, 0], [1, 1, 1], [1, -1, 1], [0, 0, 2]]) / 2,
     6: np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]]) / 24,

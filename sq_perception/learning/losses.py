@@ -187,7 +187,7 @@ class Objective:
     sharpness_end: float = 0.0
     """s at the start and the end of the run; 0 takes the values of the table."""
     framing: str = "cropped"
-    """Of the views."""
+    """Framing of the views."""
     stride: int = 2
     """Every ``stride``-th row and column of the view is a line of sight."""
 

@@ -22,7 +22,7 @@ from sq_perception.learning.choices import SIZE_RANGE, Backbone, Framing
 Array = Any
 """A NumPy array or a torch tensor."""
 BODY_OUTPUTS = 14
-"""Of a body: size 3, shape 2, translation 3, rotation 6."""
+"""Numbers of a body: size 3, shape 2, translation 3, rotation 6."""
 RESNET18_STRIDE = 32
 PLANE, EXTENT = 4, 1
 """Inputs of the network of things beside the view."""
@@ -47,9 +47,9 @@ class RegressorConfig:
     pixels: int = 64
     """Side of the views: a multiple of 32 for resnet18, of 2 to the number of ``widths`` for compact."""
     widths: tuple[int, ...] = (32, 64, 128, 256)
-    """Of compact: channels of the stem and of each stage; every stage halves the resolution."""
+    """For compact: channels of the stem and of each stage; every stage halves the resolution."""
     blocks: int = 2
-    """Of compact: residual blocks a stage."""
+    """For compact: residual blocks a stage."""
     hidden: int = 256
     size_range: tuple[float, float] = SIZE_RANGE
     """Half sizes in sides of the cube; interpolated on a logarithmic scale."""

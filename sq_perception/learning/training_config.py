@@ -36,7 +36,7 @@ CHOICES: dict[str, tuple[str, ...]] = {
 }
 """Fields that name something, and the names there are."""
 _SEEDS = 2**63
-"""That torch takes."""
+"""Seeds are below it, as torch takes them."""
 _PATIENCE = 10
 _LONGEST = 20
 _FACTOR = 0.1
@@ -125,7 +125,7 @@ class TrainingConfig:
     """cosine: warm up, then fall to 0; plateau: divide by 10 after 10 validations without progress, stop after 20."""
     learning_rate: float = 1.5e-3
     weight_decay: float = 1e-2
-    """Of adamw; adam has none."""
+    """For adamw; adam has none."""
     warm_up: int = 400
     """Steps over which the learning rate rises under the cosine schedule."""
     average: float = 0.999
@@ -197,7 +197,7 @@ class ShardTraining:
     batch: int = 64
     seed: int = 0
     threads: int = 0
-    """Of torch; 0 leaves its own choice."""
+    """Threads of torch; 0 leaves its own choice."""
     held: int = 2
     """Shards that are kept for validation."""
     validation: int = 200

@@ -27,7 +27,7 @@ from sq_perception.recordings import cloud_file, publication
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
-"""Of the pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
+"""Decimals of pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
 
 
 def newest() -> QoSProfile:

@@ -89,7 +89,7 @@ class Input:
         self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
         transport = settings.current.image_transport
         self.topic = image_topic(node, transport)
-        """Of the depth images."""
+        """Topic of the depth images."""
         self._note = ""
         self._last_image = monotonic()
         self._changed = threading.Condition()
@@ -98,7 +98,7 @@ class Input:
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=_INFOS)
         self._image_stamp = -1
-        """Of the last image."""
+        """Stamp of the last image."""
         self._are_paired = False
         """Whether an image has had a camera_info of its own stamp."""
         self._masks: OrderedDict[int, Image] = OrderedDict()

@@ -26,7 +26,7 @@ Pose = tuple[np.ndarray, np.ndarray]
 """Quaternion x y z w (4,) and translation (3,), arrays where :data:`sq_perception.segmentation.options.Pose` has
 numbers."""
 _LEAST_LENGTH = 1e-6
-"""Of a quaternion that can be normalised."""
+"""Least length of a quaternion that can be normalised."""
 
 
 class PoseError(ValueError):

@@ -45,7 +45,7 @@ SUFFIXES = (".mcap", ".db3")
 _MASKS, _RENDERED = "/mask/image", "/rendered_depth"
 """Ends of the topics of labels, and of what was recovered: the latter is read where nothing else shows depth."""
 _BAG_KEY, _HEAD = b"rosbag2_bagfile_information", 4096
-"""Of a bag's metadata, and the bytes that it is looked for in."""
+"""The key of a bag's metadata, and the bytes that it is looked for in."""
 _PEEKED = 10
 """Messages of a topic after which it shows no depth: the first ones may be damaged."""
 

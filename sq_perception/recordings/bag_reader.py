@@ -21,7 +21,7 @@ LARGEST = 2**29
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _CUT = "end magic"
-"""In what rosbags says of an MCAP without its end."""
+"""A part of what rosbags says of an MCAP without its end."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """What packed messages begin with; a plain one begins with the byte 0."""
 

@@ -35,7 +35,7 @@ LARGEST = 2**20
 _LONGEST = 2**12
 """Bytes of a file that holds nothing but a matrix."""
 _SKEW = 1e-6
-"""Of fx; no depth camera in use has any."""
+"""Skew as a share of fx; no depth camera in use has any."""
 _WIDTH, _HEIGHT = ("image_width", "width"), ("image_height", "height")
 _MATRIX, _PROJECTION = ("camera_matrix", "k", "K", "cam_K"), ("projection_matrix", "p", "P")
 _NO_DISTORTION = ("none", "")

@@ -35,7 +35,7 @@ _FITTED = 20000
 """About so many points of an organised cloud determine its camera, in a third of the time of all of a VGA image's."""
 _LEAST_POINTS = 100
 _POINTS_A_PIXEL = 2.0
-"""Of a cloud that is no image, so that few pixels of a surface stay empty."""
+"""Points of a cloud that is no image for each pixel, so that few pixels of a surface stay empty."""
 _LARGEST_SIDE = 1024
 _WIDEST = 1.75
 """|x / z| and |y / z| of points: 60 degrees off the axis, the edge of the widest images of depth cameras.  Clouds of

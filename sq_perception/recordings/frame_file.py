@@ -44,7 +44,7 @@ SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file
 MILLIMETRES = 1000.0
 """Units a metre."""
 TUM_SCALE = 5000.0
-"""Of the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
+"""Units a metre in the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 _TUM_NAME = re.compile(r"\d{10}\.\d{6}")
 _TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
 

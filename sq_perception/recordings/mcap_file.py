@@ -23,7 +23,7 @@ from io import BufferedWriter
 from mcap.writer import Writer
 
 CHUNK_BYTES = 4 * 2**20
-"""Of messages in a chunk: enough to pack well, little to lose."""
+"""Bytes of messages in a chunk: enough to pack well, little to lose."""
 LATEST = 2**63 - 1
 """Nanoseconds: ROS counts them with a sign."""
 

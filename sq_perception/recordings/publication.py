@@ -35,7 +35,7 @@ CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
 
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 _SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11), slice(5, 11)
-"""Of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
+"""Parts of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
 _OF_A_BODY = ("size", "shape", "translation", "rotation")
 """Columns of a message that are attributes of superquadrics of the same name."""
 _OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label")

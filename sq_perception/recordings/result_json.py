@@ -30,7 +30,7 @@ from sq_perception.tracking.session import Followed
 
 FORMAT, VERSION = "sq_perception.recovery", 1
 UNITS = {"optical": "m", "cube": "1"}
-"""Of lengths, by a frame's coordinates."""
+"""Units of lengths, by a frame's coordinates."""
 LARGEST = 2**30
 """Bytes of a file of lines that is resumed: some 10^5 frames."""
 

@@ -29,7 +29,7 @@ from sq_perception.viewing import drawings
 _MOST_POINTS = 30000
 _SCENE = "$SCENE"
 _LIT, _UNLIT = 0.32, 0.45
-"""Of a body's colour: the viewer has one lamp, of intensity 1.75, and no light where that does not shine."""
+"""Shares of a body's colour: the viewer has one lamp, of intensity 1.75, and no light where that does not shine."""
 _TEMPLATE = Path(__file__).with_name("still_page.html")
 
 

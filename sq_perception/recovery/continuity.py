@@ -69,9 +69,10 @@ _BLOCK = 8
 _QUARTILE = 1.15
 """Three quarters of normal noise lie below this many standard deviations."""
 _REACH = 1.25
-"""Of the farthest object's depth: beyond, where tables graze and walls are far, readings come and go."""
+"""Factor on the farthest object's depth: beyond, where tables graze and walls are far, readings come and go."""
 _NOISIER, _SHARED = 5.0, 25.0
-"""Of a reading's noise, and v: more is none, and the camera has moved.  Still scenes had up to 3.5 and 17."""
+"""Factor on a reading's noise, and v: more is no noise, and the camera has moved.  Still scenes had up to 3.5 and
+17."""
 _ANEW = {Status.CONVERGED: 30, Status.WEAK: 10, Status.FAILED: 30}
 """Repetitions after which a body's turn comes: a second at 30 Hz.  Chosen."""
 _OLD = 30

@@ -25,7 +25,7 @@ from sq_perception.segmentation import segments
 _POINTS = 2000
 """Enough for quantiles of heights to settle."""
 _VIEW_PIXELS = 64
-"""Of the view of a score; those of a network are its own."""
+"""Pixels a side of the view of a score; those of a network are its own."""
 _LOWEST = 0.02
 """Share of its pixels that are an object's lowest."""
 _SURROUNDED, _RIM_HEIGHT = 0.6, 0.01

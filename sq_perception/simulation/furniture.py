@@ -83,7 +83,7 @@ class _Place:
 
 
 _Parts = tuple[list[Superquadric], float]
-"""Of a piece of furniture, and how far below the things the floor is."""
+"""Parts of a piece of furniture, and how far below the things the floor is."""
 
 
 def _carton(place: _Place, rng: np.random.Generator) -> _Parts:

@@ -20,7 +20,7 @@ from sq_perception.simulation.things_on_table import ThingsOnTable
 
 _TURN = float(np.deg2rad(70.0))
 _BEHIND = (0.03, 0.4)
-"""Of the edge, behind the farthest reading of a thing."""
+"""Distance of the edge, metres, behind the farthest reading of a thing."""
 _BELOW = (0.05, 0.9)
 _MOST = 10
 _HALF_SIZES = (0.02, 0.5)

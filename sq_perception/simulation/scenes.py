@@ -46,7 +46,7 @@ _GAP = 0.015
 _FLAT_BELOW = 0.5
 _ATTEMPTS = 2000
 _VIEWS = 10
-"""Of the table, one after the other: in one of seven ten bodies find no room."""
+"""Views of the table, one after the other: in one of seven ten bodies find no room."""
 _FARTHEST = 4.0
 
 

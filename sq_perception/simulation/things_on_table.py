@@ -44,7 +44,7 @@ _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many a thing can neither lean nor be stacked where it is tried."""
 _GAP = 0.003
 _ALONG = 1e-6
-"""Of a unit vector: what comes no nearer than this to a plane moves along it."""
+"""Component of a unit vector: what comes no nearer than this to a plane moves along it."""
 _LEAN = tuple(np.deg2rad([8.0, 35.0]))
 _NEAREST = 0.35
 _TRIES = 60

@@ -22,7 +22,7 @@ from sq_perception.imaging.canonical_view import HIDDEN, MARGIN, NEAREST, OUTLIE
 _NOTHING, _BEHIND = -1e300, -2e300
 """In place of the z that a ray meets: it meets no surface, or an occluder before it could."""
 _MOST_ROUNDS = 4
-"""Of fitting a view to what it shows; where there is an occluder, the first one finds where that begins."""
+"""Rounds of fitting a view to what it shows; where there is an occluder, the first one finds where that begins."""
 _SAME_EXTENT = 0.005
 _Sensed: TypeAlias = tuple[bool, float, float]
 """Whether a pinhole camera sees, its eye's z, and the step of depths, 0 for none."""

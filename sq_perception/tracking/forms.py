@@ -37,7 +37,7 @@ _SIZE_PER_SHAPE = 0.1
 _SAME_NAME = np.pi / 4
 """Radians: nearer to an axis than to any other one."""
 _SELDOM_TURNED = 2 * np.log(100)
-"""Of d^2 + log det S: of the bodies that a frame shows, a hand has turned fewer than one in a hundred so far."""
+"""Cost in d^2 + log det S: of the bodies that a frame shows, a hand has turned fewer than one in a hundred so far."""
 
 
 def _turns() -> np.ndarray:
@@ -53,7 +53,7 @@ def _turns() -> np.ndarray:
 
 TURNS = _turns()
 EXACT = 8
-"""Of the turns so many describe the same body; the others need its exponents exchanged."""
+"""The number of turns that describe the same body; the others need its exponents exchanged."""
 _QUATERNIONS = quaternions.from_matrix(TURNS)
 
 

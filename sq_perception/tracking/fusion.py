@@ -53,8 +53,8 @@ VIEW_ANGLE = 0.25
 VIEWS = 16
 """Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
 _BETTER = 4.0
-"""Of variances: a look is far better that halves a deviation.  Chosen: of 224 looks at eight simulated bodies that
-nothing hid, the least sure first look had 2.1 times a later one's."""
+"""Ratio of variances: a look is far better that halves a deviation.  Chosen: of 224 looks at eight simulated bodies
+that nothing hid, the least sure first look had 2.1 times a later one's."""
 
 
 class Views(NamedTuple):

@@ -21,8 +21,8 @@ from sq_perception.imaging.camera import Camera
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
 _TOLERANCE = 0.25
-"""Of the smallest half size: a depth that differs by less is the body's own.  Chosen: above noise and misfit, below
-a thing that stands behind."""
+"""Share of the smallest half size: a depth that differs by less is the body's own.  Chosen: above noise and misfit,
+below a thing that stands behind."""
 _TOLD = 0.25
 """Share of the points of the near side that have to tell something, three of mostly twelve.  Chosen."""
 

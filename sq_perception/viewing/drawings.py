@@ -20,7 +20,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
 ROWS, COLUMNS = 32, 32
-"""Of a mesh; multiples of 8, so that the corners of a box are among the points."""
+"""Rows and columns of a mesh; multiples of 8, so that the corners of a box are among the points."""
 SHELL_SIGMAS = 2.0
 """Standard deviations between a body and its shell."""
 LARGEST_SHELL = 3.0
@@ -31,9 +31,9 @@ _SPAN_PERCENTILES = (1.0, 99.0)
 _SPAN_POINTS = 20000
 _NEAR_GREY, _FAR_GREY = np.array([150.0, 162, 182]), np.array([52.0, 62, 84])
 _POINT_SHARE = 0.5
-"""Of the pixels that a point stands for, so that what lies behind the points is to be seen between them."""
+"""Share of the pixels that a point stands for, so that what lies behind the points is to be seen between them."""
 _LEAST_SPAN = 0.05
-"""Of the depth at the far end: a flat wall is not to be drawn in the colours of its noise."""
+"""Share of the depth at the far end: a flat wall is not to be drawn in the colours of its noise."""
 
 
 @dataclass(frozen=True, eq=False)

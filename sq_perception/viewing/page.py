@@ -25,7 +25,7 @@ from sq_perception.viewing.tables import NodeState
 TITLE = "sq_perception: superquadrics from depth"
 _PANEL_WIDTH = 420
 _DECIMALS = 7
-"""Of a number that is shown or typed; viser would cut off those that the value at the beginning has not."""
+"""Decimals of a number that is shown or typed; viser would cut off those that the value at the beginning has not."""
 _TYPING = 0.8
 """Seconds without another change after which the typing of a value has ended."""
 _SHOWN = {

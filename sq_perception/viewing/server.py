@@ -54,7 +54,7 @@ class PageServer(viser.ViserServer):
     """viser's server; see the module."""
 
     connections: weakref.WeakSet[Any]
-    """Of websockets; set by :func:`serve`."""
+    """Open websockets; set by :func:`serve`."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
         """None: no tunnel to the internet."""
