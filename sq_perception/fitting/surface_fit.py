@@ -1,10 +1,22 @@
-"""The exact fit of one superquadric to one object of a depth image.
+"""The fit of one superquadric to one object of a depth image.
 
 Residuals run along the true rays of the pixels, so that one code serves orthographic and pinhole cameras: the object's
 pixels pull the surface onto what they measured, the pixels beside it keep the body out of the space they saw to be
 empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.problem` for a fit as
-data, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant` for its two courses, and
-:mod:`sq_perception.fitting.quality` for the status and accuracy of the result.
+data, and :mod:`sq_perception.fitting.quality` for the status and accuracy of the result.
+
+Which course fits
+-----------------
+There are two, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant`.  A model error that is
+given decides: the exact one for 0, else the tolerant one.  Otherwise what is known of the object does:
+
+thing       it stands on a plane, or its hull is predicted: tolerant; but the exact course's body if that leaves no more
+            than the noise, sought cheaply, before where readings are fine, else after and from the tolerant one's body
+may stray   neither, but a pinhole camera saw it and noise may hide how it strays from a superquadric: exact; what
+            leaves more than the noise goes on in the tolerant one
+else        such as the thesis' bodies: exact
+
+Bodies of the first two kinds have the deviations of things, whichever course found them.
 
 Frames and units: optical frame, metres, radians.
 """
@@ -14,8 +26,8 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
-from functools import cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
@@ -98,59 +110,119 @@ def fit(
     crop = Crop.around(depth, mask, camera, options.noise)
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
-    undecided = options.model_error is None
-    model_error = min(MODEL_ERROR, _MODEL_SHARE * crop.footprint * math.sqrt(np.count_nonzero(crop.mask)))
-    fine = crop.noise.sigma < _FINE_NOISE * model_error
-    # Who calls may know no plane and no hull, and what a camera measured is mostly a thing all the same.
-    is_doubtful = camera.is_pinhole and not fine and not _fills(mask, depth)
-    if undecided and (later is not None if options.plane is None else fine):
-        exactly = _exactly(crop, options, given, later, began)
-        if exactly is not None and not (is_doubtful or (camera.is_pinhole and _is_thing(mask, depth, options))):
-            return assessed(exactly, began)
-        if (thing := _as_thing(exactly)) is not None:
-            return assessed(thing, began)
-    is_thing = undecided and _is_thing(mask, depth, options)
-    if is_thing:
-        # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
-        # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
-        options = replace(options, model_error=model_error)
-    observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
-    reason = _hopeless(observation)
-    if reason:
+    task = _Task(depth, mask, camera, crop, options, given, later, began)
+    solution = _undecided(task) if options.model_error is None else _solved(task, options)
+    if solution is None:
+        observation = task.observed(options)
         body = starts.enclosing_box(observation.points, observation.footprint)
-        return failed(body, observation, reason, began)
-    course = tolerant if options.model_error else exact
-    given = given if later is None else later()
-    solution = course.solve(Problem.of(observation, options, began), given)
-    if undecided and course is exact and is_doubtful:
-        solution = _as_thing(solution) or _strayed(crop, replace(options, model_error=model_error), solution, given)
-    untried = options.plane is None or not fine
-    if is_thing and untried and _is_explained(solution, crop.noise.sigma):
-        exactly = _as_thing(_exactly(crop, options, [solution.state, *given], None, began))
-        solution = solution if exactly is None else _or_else(exactly, solution.state)
+        return failed(body, observation, _hopeless(observation), began)
     return assessed(solution, began)
 
 
-def _is_thing(mask: np.ndarray, depth: np.ndarray, options: FitOptions) -> bool:
-    """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
-    if options.plane is not None:
-        return True
-    return not _fills(mask, depth) and options.predicted_hull() is not None
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """An object that is to be fitted, and what its course depends on.
+
+    Attributes
+    ----------
+    depth, mask, camera
+    crop
+        What of them is near the object.
+    options
+    given, later
+        Where to begin; ``later`` returns the starts where they cost time.
+    began
+        Of :func:`time.perf_counter`.
+    """
+
+    depth: np.ndarray
+    mask: np.ndarray
+    camera: Camera
+    crop: Crop
+    options: FitOptions
+    given: list[State]
+    later: Callable[[], list[State]] | None
+    began: float
+
+    def starts(self) -> list[State]:
+        return self.given if self.later is None else self.later()
+
+    def is_thing(self) -> bool:
+        """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
+        if self.options.plane is not None:
+            return True
+        return not self.fills_image and self.options.predicted_hull() is not None
+
+    @cached_property
+    def model_error(self) -> float:
+        """How far the object strays from a superquadric if it is a thing, metres."""
+        return min(MODEL_ERROR, _MODEL_SHARE * self.crop.footprint * math.sqrt(np.count_nonzero(self.crop.mask)))
+
+    @property
+    def of_things(self) -> FitOptions:
+        """The options for a thing."""
+        return replace(self.options, model_error=self.model_error)
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether the noise is so far below what things stray that it hides nothing of it."""
+        return self.crop.noise.sigma < _FINE_NOISE * self.model_error
+
+    @property
+    def may_stray(self) -> bool:
+        """Whether the object may be a thing though nobody says so: what a camera measured mostly is one."""
+        return self.camera.is_pinhole and not self.is_fine and not self.fills_image
+
+    @cached_property
+    def fills_image(self) -> bool:
+        """Whether the object is all that was measured, as the unit cube's bodies and walls before a camera are."""
+        return fills(box(self.mask), np.isfinite(self.depth) & (self.depth > 0))
+
+    def observed(self, options: FitOptions) -> Observation:
+        return self.crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
 
 
-def _fills(mask: np.ndarray, depth: np.ndarray) -> bool:
-    """Whether the object fills what was measured, as the unit cube's bodies and walls before a camera do."""
-    return fills(box(mask), np.isfinite(depth) & (depth > 0))
+def _undecided(task: _Task) -> Solution | None:
+    """By the course that explains the object, see the module; None if no body can be fitted to it."""
+    options = task.options
+    exact_first = task.later is not None if options.plane is None else task.is_fine
+    if exact_first:
+        exactly = _exactly(task, task.given, task.later)
+        if exactly is not None and not (task.may_stray or (task.camera.is_pinhole and task.is_thing())):
+            return exactly
+        if (thing := _as_thing(exactly)) is not None:
+            return thing
+    if not task.is_thing():
+        solution = _solved(task, options)
+        if solution is not None and task.may_stray:
+            return _as_thing(solution) or _strayed(task, solution)
+        return solution
+    # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
+    # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
+    solution = _solved(task, task.of_things)
+    was_tried = options.plane is not None and task.is_fine
+    if solution is None or was_tried or not _is_explained(solution, task.crop.noise.sigma):
+        return solution
+    exactly = _as_thing(_exactly(task, [solution.state, *task.starts()], None))
+    return solution if exactly is None else _or_else(exactly, solution.state)
 
 
-def _strayed(crop: Crop, options: FitOptions, exactly: Solution, given: list[State]) -> Solution:
-    """What the tolerant course makes of an object of which the exact one left more than the noise."""
-    problem = exactly.problem
-    if exactly.spread_factor > 1 or problem.late:  # it is of that course already
-        return replace(exactly, spread_factor=tolerant.SPREAD)
-    observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
-    strayed = replace(Problem.of(observation, options, 0.0), deadline=problem.deadline)
-    return tolerant.solve(strayed, [exactly.state, *given])
+def _solved(task: _Task, options: FitOptions) -> Solution | None:
+    """By the course of a model error; None if no body can be fitted."""
+    observation = task.observed(options)
+    if _hopeless(observation):
+        return None
+    course = tolerant if options.model_error else exact
+    return course.solve(Problem.of(observation, options, task.began), task.starts())
+
+
+def _exactly(task: _Task, given: list[State], later: Callable[[], list[State]] | None) -> Solution | None:
+    """The body that explains the image down to its noise, if one is cheaply found."""
+    options = replace(task.options, model_error=0.0)
+    observation = task.observed(options)
+    if _hopeless(observation):
+        return None
+    return exact.solve_cheaply(Problem.of(observation, options, task.began), given, later)
 
 
 def _as_thing(exactly: Solution | None) -> Solution | None:
@@ -160,24 +232,24 @@ def _as_thing(exactly: Solution | None) -> Solution | None:
     return replace(exactly, spread_factor=tolerant.SPREAD)
 
 
-def _or_else(exactly: Solution, thing: State) -> Solution:
-    """The same, with what the tolerant course makes of it as another body that the image allows."""
-    return replace(exactly, alternatives=(*exactly.alternatives, Alternative(thing, _AS_A_THING)))
-
-
-def _exactly(
-    crop: Crop, options: FitOptions, given: list[State], later: Callable[[], list[State]] | None, began: float
-) -> Solution | None:
-    """The body that explains the image down to its noise, if one is cheaply found."""
-    trusted = crop.observed(0.0, options.nan_is_empty, options.plane)
-    if _hopeless(trusted):
-        return None
-    return exact.solve_cheaply(Problem.of(trusted, replace(options, model_error=0.0), began), given, later)
+def _strayed(task: _Task, exactly: Solution) -> Solution:
+    """What the tolerant course makes of an object of which the exact one left more than the noise."""
+    problem = exactly.problem
+    if exactly.spread_factor > 1 or problem.late:  # it is of that course already
+        return replace(exactly, spread_factor=tolerant.SPREAD)
+    options = task.of_things
+    strayed = replace(Problem.of(task.observed(options), options, 0.0), deadline=problem.deadline)
+    return tolerant.solve(strayed, [exactly.state, *task.starts()])
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
     return MEDIAN_TO_SIGMA * quantile(np.abs(solution.distances), 0.5) < noise
+
+
+def _or_else(exactly: Solution, thing: State) -> Solution:
+    """The same, with what the tolerant course makes of it as another body that the image allows."""
+    return replace(exactly, alternatives=(*exactly.alternatives, Alternative(thing, _AS_A_THING)))
 
 
 def warm_up() -> None:
