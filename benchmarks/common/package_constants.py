@@ -29,7 +29,7 @@ FIXED = {
     "LANES": "a length of vectors",
     "RAY_COLUMNS": "a number of columns",
     "_ROWS": "a number of rows",
-    "_MEDIAN_TO_SIGMA": "of the normal distribution",
+    "MEDIAN_TO_SIGMA": "of the normal distribution",
     "_EIGHTH_TURN": "an angle of symmetry",
     "CLASSIC": "a name",
     "SAMPSON": "a name",

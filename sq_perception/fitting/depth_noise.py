@@ -12,13 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.geometry import quantiles
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
 
 _SAMPLES = 1500
 """Of differences: their median is then known to 3 %."""
-MEDIAN_TO_SIGMA = quantiles.MEDIAN_TO_SIGMA
-"""Of absolute values of a normal distribution."""
 _FEWEST = 8
 """Differences that it takes: with fewer, one edge within the mask is the median."""
 

@@ -26,7 +26,6 @@ import numpy as np
 
 from sq_perception.fitting import rounding, starts, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
-from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.outline import sharpened, without_shrunk_edge
@@ -45,7 +44,7 @@ from sq_perception.fitting.problem import (
 )
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import deviation
 
 _MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
 """Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: to distinguish bodies, and under much noise."""
@@ -160,7 +159,7 @@ def _enough_rays(observation: Observation) -> int:
 def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
     """The rays whose points lie near the surface, as seen by the majority."""
     distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
-    spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(distance, 0.5))
+    spread = max(observation.sigma, deviation(distance))
     return hits[distance < _OUTLIER * spread]
 
 

@@ -34,7 +34,6 @@ import numpy as np
 
 from sq_perception.fitting import exact, starts, tolerant
 from sq_perception.fitting.covariance import Alternative
-from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
@@ -42,7 +41,7 @@ from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import deviation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
@@ -244,7 +243,7 @@ def _strayed(task: _Task, exactly: Solution) -> Solution:
 
 def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
-    return MEDIAN_TO_SIGMA * quantile(np.abs(solution.distances), 0.5) < noise
+    return deviation(np.abs(solution.distances)) < noise
 
 
 def _or_else(exactly: Solution, thing: State) -> Solution:

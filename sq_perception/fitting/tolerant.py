@@ -38,7 +38,6 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting import revolution, unseen
-from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.fit import INLIER
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.problem import (
@@ -56,7 +55,7 @@ from sq_perception.fitting.problem import (
 from sq_perception.fitting.rays import SAMPLE
 from sq_perception.fitting.residuals import mean_loss, surface_distance
 from sq_perception.fitting.starts import on_plane, principal
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import deviation
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 """Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
@@ -137,8 +136,7 @@ def _hollow_as_hull(solution: Solution, starts: Sequence[State]) -> Solution:
 def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution:
     """The same where an exact body was sought in vain: what ``best`` leaves becomes the model error."""
     hits = problem.observation.object_rays(FINAL_RAYS)
-    distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
-    left_over = MEDIAN_TO_SIGMA * quantile(distance, 0.5)
+    left_over = deviation(np.abs(surface_distance(hits, best.parameters, best.rotation)))
     observation = problem.observation
     observation = replace(observation, model_error=float(np.hypot(observation.model_error, left_over)))
     return solve(replace(problem, observation=observation, terms=terms_of(observation, problem.options)), given)
