@@ -62,8 +62,8 @@ def support(
     In this order: the level top of another object, the frame's plane if the object reaches down to it, another plane
     right below it.  Where there is none of these, an object some way above the frame's plane stands on it all the same:
     on top of others, or reaching down unseen, as a box seen from above does.  It does not if it lies behind that plane,
-    is high above it, as what is held up before a wall, or if something of no object, no farther away, is beside it:
-    then it stands on a board of which only the front is seen, before a wall.
+    goes on below it by more than noise, is high above it, as what is held up before a wall, or if something of no
+    object, no farther away, is beside it: then it stands on a board of which only the front is seen, before a wall.
 
     Parameters
     ----------
@@ -75,18 +75,18 @@ def support(
     if found.plane is None:
         return None
     low, median = obj.levels(found.plane)
-    behind = median <= 0
-    top = None if behind else _top_under(obj, low, others, found.plane)
+    behind, reach = median <= 0, _reach(obj)
+    top = None if behind or low < reach else _top_under(obj, low, others, found.plane)
     if top is not None:
         return top
-    if not behind and abs(low) < _HOVERING:
+    if not behind and -reach <= low < _HOVERING:
         return found.plane
     other = segments.support_under(found, obj.label, depth, camera, options)
     if other is not None:
         lowest, middle = obj.levels(other)
         if abs(lowest) < _HOVERING and middle > 0:
             return other
-    if behind or low > _HIGHEST_STACK:
+    if behind or low < -reach or low > _HIGHEST_STACK:
         return None
     is_held = low > _NOT_ON_IT and _is_held(obj, low, depth, camera, found.labels, found.plane)
     return None if is_held else found.plane
@@ -107,12 +107,17 @@ def _is_held(
     return bool(np.count_nonzero(above) > _HELD * np.count_nonzero(beside))
 
 
+def _reach(obj: SeenObject) -> float:
+    """Metres by which what is on a plane may be off it, at the object's distance."""
+    return TOLERANCE * float(support_plane.noise_growth(np.array(quantile(obj.depth_crop[obj.mask_crop], 0.5))))
+
+
 def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane: np.ndarray) -> np.ndarray | None:
     """The level top (4,) of another object under this one, whose lowest pixels are ``low`` above a plane (4,)."""
     near = [other for other in others if other.label != obj.label and _meet(obj.window, other.window)]
-    reach = TOLERANCE * float(support_plane.noise_growth(np.array(quantile(obj.depth_crop[obj.mask_crop], 0.5))))
-    if not near or low < reach:
+    if not near:
         return None
+    reach = _reach(obj)
     axes, best = support_plane.across(plane[:3]), 0.0
     points = obj.points
     feet = _seen_from_above(points[points @ plane[:3] + plane[3] < low + _FEET], axes)

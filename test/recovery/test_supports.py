@@ -7,13 +7,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from table_scenes import VGA, Table
+from table_scenes import VGA, Table, noisy
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.recovery import seen_object, supports
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.segments import from_labels
+from sq_perception.simulation.scenes import plane_depth
 
 LOW_BOX = (0.12, 0.1, 0.04)
 
@@ -77,6 +78,25 @@ def test_one_between_two_of_its_height_stands_on_the_table() -> None:
     bodies = [table.body(-0.1, 0, (0.04, 0.1, 0.04)), table.body(0.1, 0, (0.04, 0.1, 0.04))]
     bodies.append(table.body(0, 0, (0.055, 0.05, 0.08)))
     assert abs(heights(table, bodies)[2]) < 2e-3
+
+
+@pytest.mark.parametrize("drop", [0.015, 0.018, 0.05])
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_what_reaches_below_the_table_stands_on_what_is_lower_or_on_nothing_known(drop: float, is_seen: bool) -> None:
+    """On a step beside the table, or in a hole of it that it fills: it does not end where the table is."""
+    table = Table()
+    lower = table.plane + np.array([0, 0, 0, drop])
+    depth, index = raycast.render(table.body(0.15, 0, (0.04, 0.03, 0.06), height=-drop), VGA)
+    beside = (np.arange(VGA.width) > 360) & is_seen
+    ground = np.where(beside, plane_depth(lower, VGA), plane_depth(table.plane, VGA))
+    # Of what stands in a hole the whole front is seen, as if the table before it were of glass.
+    labels = np.where((depth < ground) | ((index == 0) & ~beside), index + 1, 0).astype(np.int32)
+    depth = noisy(np.where(labels > 0, depth, ground), 1e-3)
+    found = replace(from_labels(labels, depth, VGA), plane=table.plane)
+    (box,) = seen_object.objects(depth, found, VGA)
+    plane = supports.support(box, [box], depth, VGA, found, SegmentationOptions())
+    assert (plane is not None) == is_seen
+    assert plane is None or abs(plane[3] - lower[3]) < 3e-3
 
 
 @pytest.mark.parametrize("wall", [1.0, 1.2, 1.4])
