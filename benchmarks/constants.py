@@ -140,6 +140,7 @@ class Seen(NamedTuple):
     superquadric: Superquadric
     covariance: np.ndarray
     is_predicted: bool
+    seen: np.ndarray
     repeats: int = 0
 
 
@@ -162,7 +163,7 @@ def tracked_frames() -> list[tuple[tracking.View, list[Seen], list[Superquadric]
                 continue
             if one.label == 3 and k % 2:
                 covariance = np.full_like(covariance, np.nan)
-            seen.append(Seen(body, covariance, one.is_predicted))
+            seen.append(Seen(body, covariance, one.is_predicted, one.seen))
             truths.append(truth)
         depth = np.where((view.labels == 2) & (12 <= k < 17), view.depth + 1.0, view.depth)
         made.append((replace(view, depth=depth), seen, truths))

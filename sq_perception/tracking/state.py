@@ -55,6 +55,9 @@ class Observed(Protocol):
     @property
     def repeats(self) -> int: ...
 
+    @property
+    def seen(self) -> np.ndarray: ...
+
 
 def difference(state: np.ndarray, other: np.ndarray) -> np.ndarray:
     """The error (..., 11) that leads from one state (..., 12) to another."""

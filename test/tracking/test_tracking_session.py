@@ -55,6 +55,24 @@ def test_a_body_moved_by_a_hand_is_never_published_where_it_was(rng):
             np.testing.assert_allclose(found.superquadric.gauge(points), seen.superquadric.gauge(points), rtol=1e-9)
 
 
+def test_what_spans_more_than_its_track_is_published_as_it_is_seen(rng):
+    """A bowl in the place of a carton: of sizes so unsure that they might be the carton's, but nothing that small can
+    be seen so wide.  What stays is seen to its ends, and fused."""
+    carton, bowl = body((0.04, 0.03, 0.025)), body((0.1, 0.09, 0.06))
+    unsure = state.in_metres(noise(0.3, 0.5, 0.05, 0.5), bowl.size)
+    for spanned in (np.full(3, np.nan), np.array([0.9, 0.9, 0.5])):
+        one = TrackingSession()
+        for k in range(10):
+            seen = draw(carton, noise(0.02, 0.03, 0.001, 0.02), rng)._replace(seen=np.ones(3))
+            (found,) = one.follow([seen], 0.1 * k)
+            assert found.is_fused
+        (found,) = one.follow([Seen(bowl, unsure, seen=spanned)], 1.0)
+        assert found.id == 1
+        assert found.is_fused == np.isnan(spanned).all()
+    np.testing.assert_allclose(np.sort(found.superquadric.size), np.sort(bowl.size))
+    np.testing.assert_allclose(np.sort(found.sigma_size), np.sort(0.3 * bowl.size))
+
+
 def test_an_old_answer_counts_where_the_camera_was_corrected(rng):
     """Still frames repeat an answer; then the map moves the camera by 4 cm: no body stays where the old pose had it."""
     one, truth = TrackingSession(), body()
