@@ -23,10 +23,11 @@ from sq_perception.fitting.cost import Terms
 from sq_perception.fitting.covariance import Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.observation import ON_SUPPORT, Observation
 from sq_perception.fitting.options import MODEL_ERROR, FitOptions, limits
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
 # Rays and steps of the stages: chosen on benchmarks/single_body.
@@ -105,7 +106,18 @@ class Problem:
 
     @classmethod
     def of(cls, observation: Observation, options: FitOptions, began: float) -> Problem:
-        """The problem of a superquadric that leaves nothing but noise; ``began`` as by ``time.perf_counter``."""
+        """The problem of a superquadric that leaves nothing but noise; ``began`` as by ``time.perf_counter``.
+
+        Raises
+        ------
+        ValueError
+            If most of the object lies behind its support, as where the normal of that has the wrong sign.
+        """
+        if options.plane is not None:
+            height = quantile(observation.points @ options.plane[:3] + options.plane[3], 0.5)
+            if height < -ON_SUPPORT:
+                turned = "does its normal n point away from the support?"
+                raise ValueError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
         terms, bounds = terms_of(observation, options), limits(observation.points)
         return cls(observation, options, terms, bounds, began + options.time_budget)
 

@@ -50,6 +50,14 @@ def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(
     assert volume_iou(fit.superquadric, truth) > 0.97
 
 
+def test_a_plane_before_the_object_is_refused(rng: np.random.Generator) -> None:
+    """As other libraries' planes have it, whose normals point to either side; else it is a body on the wrong side."""
+    depth, mask = image(CAN, rng)
+    with pytest.raises(ValueError, match="does its normal n point away from the support"):
+        surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=-TABLE))
+    surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=2 * TABLE))
+
+
 def test_a_right_mask_keeps_its_pixels_whatever_the_plane(rng: np.random.Generator) -> None:
     depth, mask = image(BOX, rng)
     crop = Crop.around(depth, mask, CAMERA, None)
