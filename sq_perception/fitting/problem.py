@@ -116,7 +116,7 @@ class Problem:
         if options.plane is not None:
             height = quantile(observation.points @ options.plane[:3] + options.plane[3], 0.5)
             if height < -ON_SUPPORT:
-                turned = "does its normal n point away from the support?"
+                turned = "is it what this object stands on, and does its normal n point away from that?"
                 raise ValueError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
         terms, bounds = terms_of(observation, options), limits(observation.points)
         return cls(observation, options, terms, bounds, began + options.time_budget)

@@ -53,7 +53,7 @@ def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(
 def test_a_plane_before_the_object_is_refused(rng: np.random.Generator) -> None:
     """As other libraries' planes have it, whose normals point to either side; else it is a body on the wrong side."""
     depth, mask = image(CAN, rng)
-    with pytest.raises(ValueError, match="does its normal n point away from the support"):
+    with pytest.raises(ValueError, match="does its normal n point away"):
         surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=-TABLE))
     surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=2 * TABLE))
 
