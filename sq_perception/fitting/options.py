@@ -48,8 +48,9 @@ class FitOptions:
         those of which less than 6 cm are seen, what is left over for others.
     plane
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
-        floats.  A body does not reach below it, and is expected to lie on one of its faces.  One that most of the
-        object is behind is refused: other libraries' normals point to either side.
+        floats.  A body does not reach below it, and is expected to lie on one of its faces.  It is taken at its word: a
+        body on one that is a centimetre off ends where that is, and does not say so.  One that most of the object is
+        behind is refused: other libraries' normals point to either side.
     expected
         A body in the optical frame, or a function that returns it, that limits how large the object may be where the
         image does not: the prediction of a network.  A wide prior with long tails; asked for only where it matters.
