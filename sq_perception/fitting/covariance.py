@@ -1,19 +1,19 @@
 """The covariance of a fitted body.
 
 With the whitened residuals r and their Jacobian J at the optimum, the covariance is (J^T J / s^2 + P)^-1, where
-s^2 = max(1, mean of r^2) lets a body that does not explain the data be less sure of itself, and P is the precision of a
-wide prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image leaves open,
-such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts
-with the noise or a whole pixel, whichever is more: its errors are no independent noise.
+s^2 = max(1, mean of r^2) makes a body that does not explain the data less certain, and P is the precision of a wide
+prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image leaves open, such as
+the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts with the
+noise or a whole pixel, whichever is more: its errors are no independent noise.
 
-A predicted hull says itself how it errs, and its residuals r_h are apart from these: J_h^T J_h / (1 + |r_h|^2 / nu) is
-added to J^T J / s^2.  The farther off a body is, the less it counts, as the weight (nu + J) / (nu + |r_h|^2) of a t
-distribution with nu degrees of freedom in J directions falls; but it begins at 1, not at 1 + J / nu, 15 here: with that
-91 instead of 97 % of the half sizes of 196 things of benchmarks/household_things, seeds from 7000, are within two
-deviations, and sigma and error rank less alike.
+A predicted hull comes with its own error model, so its residuals r_h are not among r: J_h^T J_h / (1 + |r_h|^2 / nu) is
+added to J^T J / s^2.  The farther off the hull a body is, the less the hull counts, like the weight
+(nu + J) / (nu + |r_h|^2) of a t distribution with nu degrees of freedom in J directions; but the factor begins at 1,
+not at 1 + J / nu, 15 here: with that, 91 instead of 97 % of the half sizes of 196 things of
+benchmarks/household_things, seeds from 7000, are within two deviations, and sigma and error rank less alike.
 
-That describes one valley of the cost, as if the thing were a superquadric.  Other bodies that the image allows add
-their second moments about the result, and so does the hull that a body lies beside.
+The above describes one valley of the cost, as if the thing were a superquadric.  Other bodies that the image allows add
+their second moments about the result, and so does a predicted hull that the body does not match.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 
 WEAK_SHARE = 0.15
-"""A half size whose standard deviation exceeds this share of it is called undetermined."""
+"""Standard deviation of a half size, as a share of it, above which it is called undetermined."""
 _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 """Standard deviations of the prior: a factor e, half of the range of an exponent, a radian."""
 
 
 def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: HullPrior | None = None) -> np.ndarray:
-    """(11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
+    """Covariance (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
 
-    ``outline`` is the standard deviation of the outline, metres, ``hull`` the prediction of which the terms are.
+    ``outline`` is the standard deviation of the outline, metres, ``hull`` the prediction that the terms hold.
     """
     stride = max(1, len(rays.hits) // SAMPLE)
     terms = terms._replace(outline_stiffness=1 / outline)
@@ -50,7 +50,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
     prior = (
         np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3) ** 2
     )
-    freedom = math.inf if hull is None else float(hull.freedom)  # of a whole number: another form to compile
+    freedom = math.inf if hull is None else float(hull.freedom)  # an int would have it compiled again
     hits, free = rays.every(stride).weighing(stride)
     others = terms._replace(hull_directions=terms.hull_directions[:0])
     information = _information(hits, free, others, terms, state.parameters, state.rotation, prior, freedom)
@@ -72,7 +72,7 @@ def _information(
     prior: np.ndarray,
     freedom: float,
 ) -> np.ndarray:
-    """The inverse (11, 11) of the covariance, of which ``prior`` (11,) is the diagonal of P and ``freedom`` nu.
+    """The inverse (11, 11) of the covariance, with ``prior`` (11,) the diagonal of P and ``freedom`` nu.
 
     ``others`` are the terms without the hull.
     """
@@ -92,7 +92,7 @@ def _information(
 
 
 def _inverse(information: np.ndarray, least: float) -> np.ndarray:
-    """The inverse of an information matrix (k, k), of which no eigenvalue lies below ``least``, that of its prior.
+    """The inverse of an information matrix (k, k) with no eigenvalue below ``least``, the smallest of its prior.
 
     Where an image is some 10^8 times as precise in one direction as the prior is in another, rounding hides the small
     eigenvalues, and an inverse may have variances below 0 or far above the prior's: the eigenvalues are then held.
@@ -106,11 +106,11 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
 
 
 def _beside(state: State, terms: Terms) -> np.ndarray:
-    """(11, 11) what a body's distance to a predicted hull adds, of sizes and centre.
+    """Second moments (11, 11) of sizes and centre that a body's distance to a predicted hull adds.
 
-    A thing that is no superquadric leaves the body beside its hull, and a wrong prediction does too.  Each end of an
-    axis errs as the directions near to it differ: whether both ends do so alike or apart, neither half their sum, the
-    size, nor half their difference, the centre, errs by more.
+    The body does not match the hull of a thing that is no superquadric, nor a wrong prediction.  Each end of an axis
+    errs by the differences in the directions near to it: whether both ends do so alike or apart, neither half their
+    sum, the size, nor half their difference, the centre, errs by more.
     """
     near = near_axes(terms.hull_directions, state.rotation)
     off = hull_distances(terms, state.parameters, state.rotation)
@@ -129,7 +129,7 @@ class Alternative(NamedTuple):
 
 
 def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
-    """(11, 11) second moments of the alternatives about a body: what several valleys of the cost add to its covariance.
+    """Second moments (11, 11) of the alternatives about a body: what several valleys of the cost add to its covariance.
 
     Sizes are compared along the axes of the body, exponents between bodies with the same z axis.
     """

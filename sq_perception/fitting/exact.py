@@ -1,17 +1,17 @@
 """The exact course: for images that a superquadric explains down to the noise.
 
-1. Starts, cheap ones first: given bodies, central symmetry, its axes turned by an eighth.  From each, few steps on few
+1. Starts, cheap ones first: given bodies, central symmetry, its axes turned by 45 degrees.  From each, few steps on few
    rays; the best go on with more rays.  More starts, of every kind, only while the best residual stays above the noise
    floor.  What no superquadric explains after that is left to :mod:`sq_perception.fitting.tolerant`, which goes on from
    the bodies that were tried.
-2. The winner on all rays: free rays where the mask lost its edge are let go, object rays far off the surface are
-   dropped, the outline's precision is read from its misfit.
+2. The winner goes on to all rays: free rays where the mask lost its edge and object rays far off the surface are
+   dropped, and the outline's precision is estimated from its misfit.
 3. The finalists that few rays do not distinguish are refined on all of them.
 4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
    that explain the image almost as well stay as alternatives and add to the covariance.
-5. Half sizes along the view that the readings leave open are walked along (:mod:`sq_perception.fitting.rounding`).
-6. What the border of the image cuts off may be longer (:mod:`sq_perception.fitting.unseen`).
-7. A half size that stays open is weighed against a prediction, likewise.
+5. Half sizes along the view that rounded readings leave open are scanned (:mod:`sq_perception.fitting.rounding`).
+6. Where the border of the image cuts the object off, longer bodies are tried (:mod:`sq_perception.fitting.unseen`).
+7. A half size that stays open is weighed against a prediction (the same module).
 
 The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
 """
@@ -47,15 +47,16 @@ from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_d
 from sq_perception.geometry.quantiles import deviation
 
 _MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
-"""Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: to distinguish bodies, and under much noise."""
+"""Rays that distinguish finalists, and most rays of the last stage under much noise: half of and twice
+:data:`~sq_perception.fitting.problem.FINAL_RAYS`."""
 _FINE_NOISE = 0.3
-"""Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
+"""Noise, in pixel widths, that the fewest rays of the last stage average out; their number grows with its square."""
 _OUTLIER = 5.0
-"""Object rays this many standard deviations off the surface of the winner are dropped: noise reaches there once in two
-million.  Kept, they look like something left to explain, and rivals are sought in vain."""
+"""Distance from the winner's surface, in standard deviations, beyond which object rays are dropped: noise reaches there
+once in two million.  Kept, they look like something left to explain, and rivals are sought in vain."""
 _SETTLED, _UNSURE = 1.03, 0.01
-"""A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
-valleys of the cost worth a look; chosen on benchmarks/single_body."""
+"""Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
+valleys of the cost are tried; chosen on benchmarks/single_body."""
 _GATE = 3.6
 """Mean squared residual after the few steps from a start, above which the next group is tried; chosen on
 benchmarks/single_body."""
@@ -63,13 +64,13 @@ _PROMISING = 2.0
 """Mean squared residual after the few steps from a cheap start, above which it is not followed.  Of 42 images that a
 body explains, none left more than 0.8; of 80 that none explains, nine in ten left more than this."""
 _UNFINISHED = 1.06
-"""Mean squared residual up to which a search that time ended has come near the noise.  Of 30 bodies of the thesis'
-protocol and 120 on tables all but one in thirty then erred by less than three deviations, of others nine in ten by
-more, typically by 5 to 40."""
+"""Mean squared residual up to which a search that the time budget ended has come near the noise.  Of 30 bodies of the
+thesis' protocol and 120 on tables, all but one in thirty below it erred by less than three standard deviations, and
+nine in ten above it by more, typically by 5 to 40."""
 _HANDED_OVER = 8
-"""Of the bodies that were tried, so many begin in the tolerant course."""
+"""Number of tried bodies, the cheapest ones, that the tolerant course starts from."""
 _HOPELESS = 2.0
-"""A rival that costs so many times more than the body at hand after its first steps is given up."""
+"""Cost of a rival after its first steps, as a multiple of the body's at hand, from which on it is given up."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
@@ -90,9 +91,9 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 
 def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], list[State]] | None) -> Solution | None:
-    """The same from the given starts and the first ones of symmetry only; None if they leave more than noise.
+    """The best body from the given starts and the first ones of symmetry only; None if it leaves more than noise.
 
-    ``later`` returns further starts that cost time: it is called only if those before do not suffice.
+    ``later`` returns further starts that cost time: it is called only if the others do not suffice.
     """
     finalists: list[State] = []
     symmetric = starts.groups(problem.observation)
@@ -108,7 +109,7 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
 
 
 def _automatic(problem: Problem) -> list[State]:
-    """Where the first groups of starts lead, as many as it takes to come near the noise."""
+    """Bodies after a few steps from the first groups of starts, as many groups as it takes to come near the noise."""
     found: list[State] = []
     for group in starts.groups(problem.observation):
         found += problem.coarse(group)
@@ -151,20 +152,20 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
 
 
 def _enough_rays(observation: Observation) -> int:
-    """Rays that bring the noise of the mean well below a pixel's width."""
+    """Number of rays that bring the noise of their mean well below a pixel's width."""
     ratio = observation.sigma / observation.footprint
     return int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
 
 
 def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
-    """The rays whose points lie near the surface, as seen by the majority."""
+    """The rays (k, 8) whose points lie near the surface, measured by the typical distance of all."""
     distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
     spread = max(observation.sigma, deviation(distance))
     return hits[distance < _OUTLIER * spread]
 
 
 def _distinct(states: Sequence[State], most: float, known: Sequence[State] = ()) -> list[State]:
-    """Those cheaper than ``most`` that end in valleys of their own."""
+    """The bodies cheaper than ``most``, one a valley of the cost, outside the valleys of ``known``."""
     chosen = list(known)
     for state in states:
         if state.cost < most and not any(alike(state, other) for other in chosen):
@@ -176,11 +177,11 @@ def _distinct(states: Sequence[State], most: float, known: Sequence[State] = ())
 
 
 def _varied(solution: Solution) -> Solution:
-    """Look beyond the valley that the search came down into: noise and poor sight hide that another one is deeper.
+    """The solution after a search of other valleys of the cost, of which noise and a poor view may hide a deeper one.
 
-    Rivals are the same body with a half size that the image hardly determines made smaller or larger, the seen face
-    in place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.
-    They go on with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
+    Rivals are the same body with a half size that the image hardly determines made smaller or larger, the seen face in
+    place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.  They
+    are fitted with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
     """
     found: list[State] = []
     while True:
@@ -202,7 +203,7 @@ def _varied(solution: Solution) -> Solution:
 
 
 def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]]:
-    """The best of a body and its rivals, and those that were refined; few rays first, all for what holds on them."""
+    """The best of a body and its rivals, and the refined rivals: few rays first, all rays for those that hold there."""
     problem, best = solution.problem, solution.state
     few = problem.draw(BASIN_RAYS, 0.2)
     reference = problem.settle(best, few)
@@ -225,7 +226,7 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
 
 
 def _alternatives(best: State, found: list[State]) -> tuple[Alternative, ...]:
-    """The other valleys that explain the image almost as well, by their likelihood."""
+    """Bodies of other valleys that explain the image almost as well, weighted by their likelihood."""
     others = [state for state in found if not alike(state, best)]
     weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
     return tuple(Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))

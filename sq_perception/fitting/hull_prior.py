@@ -1,14 +1,14 @@
-"""What is known of a thing's convex hull before its pixels are looked at: its support function, and how well.
+"""What is known of a thing's convex hull before its pixels are looked at: its support function and its uncertainty.
 
     h(n) = max over the thing of n.p,     h(n_j) ~ N(b_j, S),     j = 1 .. J
 
-n_j, b and S are in the optical frame of the camera, metres.  A superquadric is no thing: what the best one leaves over
-joins S as an error of each direction by itself, ``MODEL_SHARE`` of the thing's extent.
+n_j, b and S are in the optical frame of the camera, metres.  No thing is a superquadric: what the best one leaves over
+is added to S as an independent error of each direction, ``MODEL_SHARE`` of the thing's extent.
 
-The network predicts h ~ t_nu(b, S) with long tails (:mod:`sq_perception.learning.thing_network`); S alone, the scale of
-most errors, is what the fit takes.  With the tails the fit follows bodies that few directions agree with: that cost
-1.3 % of IoU on 229 things of benchmarks/household_things, seeds from 5000.  How sure the fitted body is depends on
-them (:mod:`sq_perception.fitting.covariance`).
+The network predicts h ~ t_nu(b, S) with long tails (:mod:`sq_perception.learning.thing_network`); the fit takes S
+alone, the scale of most errors.  With the tails the fit follows bodies that few directions agree with: that cost 1.3 %
+of IoU on 229 things of benchmarks/household_things, seeds from 5000.  The covariance of the fitted body depends on them
+(:mod:`sq_perception.fitting.covariance`).
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from functools import cached_property
 import numpy as np
 
 PULL_SHARE = 0.07
-"""Standard deviation, as a share of the thing's extent, of what pulls a body that misfits by as much again as the best
+"""Standard deviation, as a share of the thing's extent, of the pull on a body that misfits twice as much as the best
 do.  On 408 things of benchmarks/household_things, seeds from 5000, 0.05 to 0.14 change IoU by less than 0.2 %."""
 EDGE_SHARE = 0.03
-"""The same of what pulls its edges: in directions near its own axes all of the difference counts, growth too.  On 1045
-of these things, seeds from 8700, edges err by 7 % less with it, those of bottles by 7, of tools by 16 and of vessels by
-20 %, at 0.1 +- 0.1 % of IoU.  On 622 others 0.02 gains another 1 % and costs 0.3 % of IoU."""
+"""Standard deviation, likewise, of the pull on its edges: in directions near its own axes all of the difference counts,
+growth too.  On 1045 of these things, seeds from 8700, edges err by 7 % less with it, those of bottles by 7, of tools by
+16 and of vessels by 20 %, at 0.1 +- 0.1 % of IoU.  On 622 others 0.02 gains another 1 % and costs 0.3 % of IoU."""
 _NEAR_AXIS = 16
 """Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
 degrees apart."""
@@ -64,12 +64,13 @@ class HullPrior:
 
         ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits; ``rotation`` (3, 3)
         has the body's axes for columns.
-        The body that is most probable is not the one that is nearest to what is expected.  A superquadric that fits
-        has the thing's form, and S is how probable each of them is.  One that does not is a choice: b is the best
-        that is known of the thing's form, and the body shall be near to it in each direction, however unsure.  Growth
-        in all directions is left to S, as the outline determines a thing's size, but for the ends of the body's axes:
-        of whatever form, it is to be as long, wide and high as the thing.  A bottle, to which a superquadric cannot
-        taper, is too thin for its foot else.
+
+        The most probable body is not the one nearest to the prediction.  A superquadric that fits has the thing's form,
+        and S tells how probable each form is.  One that does not fit is a compromise: b is the best that is known of
+        the thing's form, and the body is to be near to it in each direction, however uncertain.  Growth in all
+        directions is left to S, as the outline determines a thing's size, except at the ends of the body's axes:
+        whatever its form, the body is to be as long, wide and high as the thing.  Otherwise the body of a bottle, as
+        superquadrics cannot taper, is too thin for its foot.
         """
         count = len(self.support)
         pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
@@ -87,5 +88,5 @@ class HullPrior:
 
 
 def near_axes(directions: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """How much (J, 3), 0 to 1, directions (J, 3) are near to either end of the axes, columns of a matrix (3, 3)."""
+    """Nearness (J, 3), 0 to 1, of directions (J, 3) to either end of each axis, the columns of ``rotation`` (3, 3)."""
     return np.asarray((directions @ rotation) ** _NEAR_AXIS)

@@ -1,18 +1,18 @@
 """What one depth image shows of one object: pixels that hit it, pixels that must miss it, and the depth noise.
 
-Object pixels: those of the mask with a depth.  Drawn systematically with weight sqrt(1 + slope^2), that is by surface
-area instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
+Object pixels: those of the mask with a depth.  They are drawn systematically with weight sqrt(1 + slope^2), that is by
+surface area instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
 
-Free pixels: those beside the mask.  One that measured something farther shows that it is empty up to there; one that
-measured something nearer shows it up to its own depth only, which binds nothing (what lies behind an occluder is
+Free pixels: those beside the mask.  One that measured something farther shows that space is empty up to there; one that
+measured something nearer shows so up to its own depth only, which constrains nothing (what lies behind an occluder is
 unknown).
 
-A pixel without a reading shows nothing where the pixels around the object were measured at all: beside a real thing it
-is the shadow of a baseline, a side seen at a grazing angle, a dark or shiny label, on the thing or beside it.  Where
+A pixel without a reading shows nothing where pixels around the object were measured at all: beside a real thing it is
+the shadow of a baseline, a side seen at a grazing angle, a dark or shiny label, on the thing or beside it.  Where
 nothing around the object was measured, as in an orthographic image of the thesis, or before a background out of range,
 it is no pixel of the object and counts as empty, unless it lies within the convex hull of the mask.
 
-Both become rays (:mod:`sq_perception.fitting.rays`) when a stage of the fit draws them.
+Both kinds become rays (:mod:`sq_perception.fitting.rays`) when a stage of the fit draws them.
 """
 
 from __future__ import annotations
@@ -34,33 +34,33 @@ from sq_perception.imaging.coherence import coherent
 from sq_perception.imaging.lens import heights
 
 _STEEPEST = 6.0
-"""Slopes above this, 80 degrees, count as this: there a pixel determines little of the depth."""
+"""Largest slope, 80 degrees; steeper pixels count as this, as they determine little of the depth."""
 BAND_PIXELS, _BAND_SHARE = 4, 0.03
-"""Width of the band around the mask whose every pixel counts, at least, as that much of a mask's edge may be missing;
-and as a share of the mask's extent."""
+"""Least width, pixels, of the band around the mask whose every pixel counts, as that much of a mask's edge may be
+missing; and its width as a share of the mask's extent."""
 _WIDER = 0.5
-"""Of the mask's extent: what the crop adds around it on both sides together."""
+"""Margins of the crop around the mask, both sides together, as a share of the mask's extent."""
 _HOLE = 5
-"""Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
+"""Width, pixels, up to which holes and notches of the mask are closed: the outline of a convex body has none."""
 _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
-"""A depth step between neighbours above so many pixel widths, plus so many noise levels, ends a surface."""
+"""Pixel widths and noise levels whose sum a depth step between neighbours exceeds where a surface ends."""
 ON_SUPPORT, _FOOT_PIXELS = 0.003, 3
-"""Metres above its support, up to which a pixel of a mask may show that, and pixels up to which the foot of an object
-is so low."""
+"""Height, metres, up to which a pixel of a mask may show the support, and width, pixels, of the part of an object's
+foot that is so low."""
 _BEHIND_SHARE = 0.02
-"""Of a mask's pixels: what goes on from an object by way of its support alone, if the mask is too large, by one pixel
-around an object of 150.  Of right masks of benchmarks/household_things one in twenty shows so much, by its sensor's
-edges, which changes no mean; with 0.05 clean boxes in masks one pixel too large lost 3 % IoU."""
+"""Share of a mask's pixels joined to the object by way of its support alone, from which on the mask is too large: by
+one pixel around an object of 150.  One in twenty right masks of benchmarks/household_things has as much, from its
+sensor's edges, which changes no mean; with 0.05, clean boxes in masks one pixel too large lost 3 % IoU."""
 _BACKGROUND_SHARE = 0.1
-"""Of the pixels next to the object: if fewer were measured, there is no background within range."""
+"""Share of the pixels next to the object: if fewer were measured, there is no background within range."""
 _COARSE = 3
-"""Far from the mask, only every third pixel in each direction is a free pixel."""
+"""Spacing, pixels in each direction, of free pixels far from the mask."""
 _FREE_MARGIN = 3.0
-"""Free space ends this many standard deviations in front of the measured depth."""
+"""Standard deviations in front of the measured depth at which free space ends."""
 _POINTS = 2000
-"""Enough for moments, boxes and quantiles of the object to settle."""
+"""Measured points of an object: enough for its moments, boxes and quantiles to settle."""
 OUTLIER_SHARE = 0.01
-"""Of the points, at either end of a direction: readings of something else that got into the mask."""
+"""Share of the points left out at either end of a direction: readings of something else that got into the mask."""
 _NO_NOISE = 1e-6
 """The least noise, as a share of the distance: what single precision resolves."""
 
@@ -114,7 +114,7 @@ class Crop:
         return cls(crop, inside, view, band, known, distance, footprint)
 
     def observed(self, model_error: float, nan_is_empty: bool | None, plane: np.ndarray | None = None) -> Observation:
-        """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``plane`` as in the options."""
+        """The crop, its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``plane`` as in the options."""
         sigma = math.hypot(self.noise.sigma, model_error)
         inside = self._coherent(_JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma, plane)
         filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
@@ -139,16 +139,16 @@ class Crop:
         )
 
     def _coherent(self, jump: float, plane: np.ndarray | None) -> np.ndarray:
-        """The mask (h, w) without what a step of more than ``jump`` metres parts from the object.
+        """The mask (h, w) without what a depth step of more than ``jump`` metres separates from the object.
 
-        A mask that is too large shows the support all around the object, and by way of this all that is behind it goes
-        on from the foot without a step: then what is above the support counts alone.
+        A mask that is too large shows the support all around the object, which joins all that is behind to the object's
+        foot without a step: then only what is above the support counts.
         """
         inside = coherent(self.depth, self.mask, jump)
         if plane is None:
             return inside
         low = heights(self.depth, self.mask, self.camera.lens, plane) <= ON_SUPPORT
-        # Of a thin thing on its support all is as low.
+        # A thin thing on its support is as low all over.
         if not low.any() or 2 * np.count_nonzero(low) > np.count_nonzero(self.mask):
             return inside
         above = coherent(self.depth, self.mask & ~low, jump)
@@ -166,16 +166,16 @@ class Observation(Crop):
     pixels : (n,)
         All pixels of the object, as indices into the crop in row-major order.
     areas : (n,)
-        Their weights for drawing.
+        Weights of these pixels for drawing.
     free : (m,)
-        The pixels beside the object that may bind it, likewise.
+        The pixels beside the object that may constrain it, likewise.
     free_pixels : int
         Number of pixels that these stand for.
     model_error : float
         How far the object may stray from a superquadric, metres; joins the noise in squares.
     points : (k, 3)
-        Some 2000 measured points of the object in the optical frame, evenly over its surface; one contiguous column
-        a coordinate, several times as fast to reduce.
+        Some 2000 measured points of the object in the optical frame, evenly over its surface; each coordinate a
+        contiguous column, which is reduced several times as fast.
     """
 
     pixels: np.ndarray
@@ -187,7 +187,7 @@ class Observation(Crop):
 
     @cached_property
     def sigma(self) -> float:
-        """Noise and model error together at the object's distance, metres."""
+        """Noise and model error at the object's distance joined in squares, metres."""
         return float(np.hypot(self.noise.sigma, self.model_error))
 
     @property
@@ -203,7 +203,7 @@ class Observation(Crop):
         return self._through(drawn(self.pixels, self.areas, count, offset), 0.0)
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
-        """At most ``count`` rays (k, 8) through free space, likewise; z is where free space ends."""
+        """At most ``count`` rays (k, 8) of free pixels, drawn evenly; z is where free space ends."""
         pixels = self.free
         if len(pixels) > count:
             pixels = pixels[((np.arange(count) + offset) * (len(pixels) / count)).astype(np.int64)]
@@ -214,7 +214,7 @@ class Observation(Crop):
         return self._through(pixels, _FREE_MARGIN)
 
     def ring(self, radius: float) -> np.ndarray:
-        """The free pixels at this distance from the mask, to half a pixel: at 1, those that touch it."""
+        """The free pixels at distance ``radius`` from the mask, to half a pixel: at 1, those that touch it."""
         return self.free[np.abs(self._distance_to_mask - radius) < 0.5]
 
     def beyond(self, band: float) -> Observation:
@@ -238,7 +238,7 @@ class Observation(Crop):
 
 
 def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """From where to where (k, 2) points (n, 3) reach along directions (k, 3), but for outliers at either end."""
+    """Least and largest coordinates (k, 2) of points (n, 3) along directions (k, 3), but for outliers at either end."""
     place = (len(points) - 1) * np.array([OUTLIER_SHARE, 1 - OUTLIER_SHARE])
     before = place.astype(int)
     after = np.minimum(before + 1, len(points) - 1)
@@ -269,7 +269,7 @@ def _sort(
     lost: np.ndarray,
     footprint: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Object pixels with their areas, free pixels, and how many pixels these stand for.
+    """Object pixels, their areas, free pixels, and how many pixels the free ones stand for.
 
     A missing depth is unknown where ``lost`` is set, and elsewhere empty.
     """
@@ -296,7 +296,7 @@ def _sort(
 
 @kernel
 def _write_areas(depth: np.ndarray, inside: np.ndarray, v: int, footprint: float, areas: np.ndarray) -> None:
-    """sqrt(1 + slope^2) along a row by central differences, the slope capped; 1 at the mask's edge: vector code."""
+    """Write sqrt(1 + slope^2) of a row: central differences, slopes capped; 1 at the mask's edge.  Vector code."""
     height, width = depth.shape
     areas[:] = 1.0
     if not 0 < v < height - 1:

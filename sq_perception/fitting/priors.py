@@ -2,14 +2,14 @@
 
 plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R^T n), h the support function, which is
             the gauge's dual norm: two nested p-norms of a n with exponents 2 - e.
-gap         the same where positive, over another sigma, Cauchy: bodies do not hover, unless they stand on other things.
+gap         as ``plane`` where positive, another sigma, Cauchy: bodies do not hover, unless they stand on other things.
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
 roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
-hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions beside a predicted one b, whitened by
+hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions against a predicted one b, whitened by
             W^T W = S^-1.
-volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
+volume      a linear price on log(a1 a2 a3), which prefers the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
 those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms in :class:`~sq_perception.fitting.cost.Terms`.
@@ -30,7 +30,7 @@ Derivatives = tuple[float, float, float, float, float, float]
 
 @kernel
 def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
-    """All terms together."""
+    """Cost of all terms together."""
     cost = 0.0
     if terms.plane_stiffness > 0.0 or terms.rest_stiffness > 0.0:
         cost += _support_cost(terms, parameters, rotation, sums)
@@ -118,7 +118,7 @@ def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, su
 
 @kernel
 def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
-    """|W (h - b)|^2."""
+    """Cost |W (h - b)|^2 of the hull."""
     count = terms.hull_directions.shape[0]
     rows = _hull_rows(terms, parameters, rotation)
     whitened = rows @ terms.hull_root.T
@@ -131,13 +131,13 @@ def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: 
 
 @kernel
 def hull_distances(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """h - b (J,), metres."""
+    """Differences h - b (J,) of the support functions, metres."""
     return _hull_rows(terms, parameters, rotation)[STEP_LENGTH]
 
 
 @kernel
 def _hull_rows(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Derivatives of h, a column a direction, and h - b in the last row: one array, vector code."""
+    """Derivatives of h, a column for each direction, and h - b in the last row: one array, for vector code."""
     count = terms.hull_directions.shape[0]
     rows = np.empty((STEP_LENGTH + 1, count))
     for j in range(count):

@@ -2,9 +2,9 @@
 
     draw      rays of the object and of free space, for one stage
     coarse    a few Levenberg-Marquardt steps from each start, with Sampson's residual on few rays: a wide basin
-    select    those that the noise does not distinguish, on more rays, then with the rendered residual
+    select    bodies that the noise does not distinguish, on more rays, then with the rendered residual
     settle    some more steps of one body with the rendered residual, on rays at hand
-    refine    the same to convergence, on all rays
+    refine    steps of one body with the rendered residual to convergence, on all rays
 
 All of them are methods of a :class:`Problem` and return bodies (:class:`State`).  Costs are mean squared residuals in
 units of the noise times the rays' weight, so that a body that leaves nothing but noise costs about that weight.
@@ -37,37 +37,37 @@ FIRST_STEPS = 5
 """Steps after which a rival that costs far more than the body at hand is given up."""
 REFINE_STEPS = 15
 FINAL_RAYS = 3000
-"""An error of the depth by a third of a pixel's width averages out to a two hundredth: chosen on
-benchmarks/single_body, like those above."""
+"""Object rays of the last stage: a depth error of a third of a pixel's width averages out to a two hundredth.  Chosen
+on benchmarks/single_body, like those above."""
 FREE_SHARE = 0.25
 """Free rays per object ray: an outline has fewer pixels than an area."""
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 3e-5
-"""Share of the cost; a stage ends before a step that promises less."""
+"""Gain, as a share of the cost, that a step must promise: a stage ends before one that promises less."""
 FINAL_GATE = 1.4
 """Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
 not finished.  Chosen on benchmarks/single_body."""
 DOUBT = 25.0
-"""Costs on the same rays that differ by D do so with a standard deviation of 2 sqrt(D) through noise: below this, 2.5
-of them, bodies go on together,"""
+"""Excess of a cost over the best up to which bodies go on together: on the same rays, noise gives a difference D a
+standard deviation of 2 sqrt(D), of which this is 2.5."""
 RIVAL = 1.3
-"""and so do those within this factor of the best, as they have not converged yet."""
+"""Factor of the best cost up to which bodies go on too, as they have not converged yet."""
 FINALISTS = 3
 """Bodies that go on from a selection; chosen on benchmarks/single_body."""
 RIVAL_SLACK = 4.0
-"""Cost that few rays may hide: one such standard deviation."""
+"""Difference of costs that few rays may hide: one such standard deviation."""
 INDEPENDENT_RAYS = 50.0
-"""As how many independent rays an object counts whose model errs: errors of neighbouring pixels are alike.  Chosen on
-scanned objects."""
+"""Number of independent rays that an object counts as where its model errs: errors of neighbouring pixels are alike.
+Chosen on scanned objects."""
 HIT_TOLERANCE = 3e-3
-"""Of g where a ray meets the body.  Rays remember where that was: this error vanishes as the search converges."""
+"""Error of g where a ray meets the body.  Rays remember where that was, so that it vanishes as the search converges."""
 PLANE_SIGMA, GAP_SIGMA, REST_SIGMA = 0.001, 0.005, 0.05
-"""Metres below the plane and above it, and sine of the angle between the normal and an axis of the body: how well a
-plane fitted to a depth image is known, and a wide prior with long tails (:mod:`sq_perception.fitting.priors`).  Both
-lengths shrink with the model error of small things."""
+"""Standard deviations, metres, of a body's reach below the plane and above it, and of the sine of the angle between the
+normal and an axis of the body: how well a plane fitted to a depth image is known, and a wide prior with long tails
+(:mod:`sq_perception.fitting.priors`).  Both lengths shrink with the model error of small things."""
 PROPORTION_SIGMA = 1.0
-"""Of a log size against the mean of the three: a factor e, a wide prior."""
+"""Standard deviation of a log size about the mean of the three: a factor e, a wide prior."""
 VOLUME_PRICE = 0.5
-"""Of log(a1 a2 a3): what the image does not determine is not to grow.  Chosen on scanned objects."""
+"""Price of log(a1 a2 a3) in the cost: what the image does not determine is not to grow.  Chosen on scanned objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ class Problem:
     Attributes
     ----------
     observation
-        What the image shows of it.
+        What the image shows of the object.
     options
         What the caller wants.
     terms
@@ -87,12 +87,12 @@ class Problem:
     deadline
         ``time.perf_counter`` after which nothing new is tried.
     independent
-        As how many independent rays the object counts where errors of neighbouring pixels are alike, however many are
-        drawn; None where every ray counts as one.
+        Number of independent rays that the object counts as, however many are drawn, where errors of neighbouring
+        pixels are alike; None where every ray counts as one.
     prior
         A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
     hull
-        A prediction of the thing's hull, which weighs in by the terms.
+        A prediction of the thing's hull, which weighs in through the terms.
     """
 
     observation: Observation
@@ -159,7 +159,7 @@ class Problem:
         return Rays(hits, free)
 
     def coarse(self, starts: Iterable[State]) -> list[State]:
-        """Where a few steps lead from each start, in their order; from the first one at least."""
+        """Bodies after a few steps from each start, in the order of the starts; from the first one at least."""
         rays = self.draw(COARSE_RAYS, 0.5)
         return self.in_time(starts, lambda start: self._minimized(SAMPSON, start, rays, COARSE_STEPS, TOLERANCE))
 
@@ -187,17 +187,17 @@ class Problem:
         return self._minimized(RENDERED, state, rays, steps, TOLERANCE)
 
     def held(self, state: State, axis: int, rays: Rays) -> State:
-        """The same with the half size along an axis kept as it is, within its limits."""
+        """A body after some steps with the rendered residual, its half size along an axis kept, within its limits."""
         lower, upper = (limit.copy() for limit in self.limits)
         lower[axis] = upper[axis] = min(max(state.parameters[axis], lower[axis]), upper[axis])
         return minimize(RENDERED, *rays, self.terms, state, (lower, upper), BASIN_STEPS, TOLERANCE)
 
     def refine(self, state: State, rays: Rays, steps: int = REFINE_STEPS) -> State:
-        """A body at the end of its valley."""
+        """A body after steps with the rendered residual to the end of its valley."""
         return self._minimized(RENDERED, state, rays, steps, FINAL_TOLERANCE)
 
     def refined_best(self, settled: Sequence[State], rays: Rays, steps: int = REFINE_STEPS) -> State:
-        """The best on these rays of bodies ranked on few; the second one only has a chance if the ranking is close."""
+        """The best body on these rays of the first two ranked on few; the second one only if the ranking is close."""
         close = [state for state in settled[:2] if state.cost < settled[0].cost + RIVAL_SLACK]
         return least([self.refine(state, rays, steps) for state in close])
 
@@ -212,7 +212,7 @@ class Solution:
     Attributes
     ----------
     problem
-        As it stands by now: observation, terms and prior of the last stage.
+        The problem of the last stage, with its observation, terms and prior.
     state, rays
         The body, and the rays on which its cost is measured.
     alternatives
@@ -220,11 +220,11 @@ class Solution:
     notes
         What the body rests on beyond the image, for the message.
     spread_factor
-        Of the covariance, where residuals err alike.
+        Factor of the covariance, where residuals err alike.
     as_hull
-        Whether it resembles the convex hull of the object only.
+        Whether the body resembles the convex hull of the object only.
     is_unfinished
-        Whether time was up before the search came near the noise, so that nobody knows how far off the body is.
+        Whether time was up before the search came near the noise, so that the body may be off by any distance.
     """
 
     problem: Problem
@@ -244,7 +244,7 @@ class Solution:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """(11, 11) of the valley of the cost that the body lies in, and of its distance to a predicted hull."""
+        """Covariance (11, 11) from the valley of the cost around the body and its distance to a predicted hull."""
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
         return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
 
@@ -255,7 +255,7 @@ class Solution:
 
 
 def terms_of(observation: Observation, options: FitOptions) -> Terms:
-    """The terms of an observation; those of the plane where one is known."""
+    """The terms of an observation, with those of the plane where one is known."""
     terms = Terms(
         hit_tolerance=HIT_TOLERANCE,
         pinhole=1.0 if observation.camera.is_pinhole else 0.0,
@@ -275,17 +275,17 @@ def terms_of(observation: Observation, options: FitOptions) -> Terms:
 
 
 def within_doubt(candidates: Iterable[State]) -> list[State]:
-    """Candidates, best first, without those that the noise cannot have made worse than the best."""
+    """Candidates, best first, without those that are worse than the best by more than noise can make them."""
     ranked = by_cost(candidates)
     least = ranked[0].cost
     return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
 
 
 def by_cost(states: Iterable[State]) -> list[State]:
-    """Cheapest first."""
+    """The bodies, cheapest first."""
     return sorted(states, key=lambda state: state.cost)
 
 
 def least(states: Iterable[State]) -> State:
-    """The cheapest."""
+    """The cheapest body."""
     return min(states, key=lambda state: state.cost)

@@ -16,16 +16,16 @@ classic     sqrt(a1 a2 a3) (g^2 - 1) / sigma at the measured point: Solina and B
 Sampson     (g - 1) / (|grad g| sigma) at the measured point: first order distance; wide basin of attraction.
 rendered    (z_hit - z) c / sigma, where the ray meets the body at z_hit: the exact statement of a depth image.
             dz_hit = -dg / (grad g . d).  c = cos / sqrt(cos^2 + kappa), with cos the incidence, tames grazing rays.
-covered     (min g - 1) / (|grad g| sigma_o) instead, where a pixel of the object misses the body; sigma_o belongs to
-            the outline.  A ray that misses even the bounding box counts by its Sampson distance.
+covered     (min g - 1) / (|grad g| sigma_o) instead, where the ray of an object pixel misses the body; sigma_o is that
+            of the outline.  A ray that misses even the bounding box counts by its Sampson distance.
 free        (1 - min g) / (|grad g| sigma_o), where the smallest g on a free ray, up to its free depth z, is below 1.
             At a minimum the point may be held fixed (envelope theorem).
 
-The scales |grad g| and c are held fixed in the derivatives, which residuals small near the answer justify.  Image
-residuals pass through Huber's loss.  The cost is the weighted sum of the losses, r^2 for small r, and of the priors
+The scales |grad g| and c are held fixed in the derivatives, as residuals are small near the solution.  Image residuals
+pass through Huber's loss.  The cost is the weighted sum of the losses, r^2 for small r, and of the priors
 (:mod:`sq_perception.fitting.priors`).
 
-Rays are worked on in blocks (:mod:`sq_perception.fitting.intersection`).
+Rays are processed in blocks (:mod:`sq_perception.fitting.intersection`).
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
 
 _TINY = 1e-12
-"""Keeps a division by a squared gradient of the gauge, 1 / metres^2, finite."""
+"""Number added to a squared gradient of the gauge, 1 / metres^2, to keep divisions by it finite."""
 
 
 @kernel
@@ -135,7 +135,7 @@ def _loss(residual: float, huber: float, terms: Terms, weight: float) -> tuple[f
 def _rendered_rows(
     filled: int, part: np.ndarray, terms: Terms, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray
 ) -> float:
-    """Rendered and covered residuals: their cost, and in the block's first and last row their scale and value."""
+    """Cost of rendered and covered residuals; writes their scale and value to the block's first and last row."""
     cost = 0.0
     for i in range(filled):
         gx, gy, gz, along = lanes[GX, i], lanes[GY, i], lanes[GZ, i], lanes[SLOPE, i]
@@ -165,7 +165,7 @@ def _rendered_rows(
 def _measured_rows(
     filled: int, stage: int, terms: Terms, parameters: np.ndarray, lanes: np.ndarray, block: np.ndarray
 ) -> float:
-    """Classic or Sampson residuals at the measured points, likewise."""
+    """Cost of classic or Sampson residuals at the measured points; writes to the block as :func:`_rendered_rows`."""
     root_of_volume = math.sqrt(parameters[0] * parameters[1] * parameters[2])
     cost = 0.0
     for i in range(filled):
@@ -183,7 +183,7 @@ def _measured_rows(
 
 @kernel
 def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: np.ndarray) -> None:
-    """The derivatives of scale * g by a step, scale from the block's first row, into rows 0 to 10."""
+    """Write the derivatives of scale * g by a step to rows 0 to 10 of the block; its first row holds the scale."""
     m11, m12, m13 = rotation[0]
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
@@ -214,7 +214,7 @@ def _free_rows(
     block: np.ndarray,
     sums: np.ndarray,
 ) -> float:
-    """The residuals of free rays that cross the bounding box: their cost, added to the normal equations."""
+    """Cost of the residuals of free rays that cross the bounding box; adds them to the normal equations."""
     lowest(filled, 1.0, LOWEST_TOLERANCE, parameters, lanes, missed)
     cost = 0.0
     for i in range(filled):
@@ -248,7 +248,7 @@ def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndar
 
 @kernel
 def mean_loss(rays: np.ndarray, huber: float, parameters: np.ndarray, rotation: np.ndarray) -> float:
-    """Mean of Huber's losses of the same in units of the noise, in front of the surface and behind it alike."""
+    """Mean of Huber's losses of the Sampson distances in units of the noise, before and behind the surface alike."""
     distance = surface_distance(rays, parameters, rotation)
     total = 0.0
     for i in range(rays.shape[0]):

@@ -1,22 +1,22 @@
 """The fit of one superquadric to one object of a depth image.
 
 Residuals run along the true rays of the pixels, so that one code serves orthographic and pinhole cameras: the object's
-pixels pull the surface onto what they measured, the pixels beside it keep the body out of the space they saw to be
-empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.problem` for a fit as
-data, and :mod:`sq_perception.fitting.quality` for the status and accuracy of the result.
+pixels pull the surface onto what they measured, the pixels beside the object keep the body out of the space they saw to
+be empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.problem` for a fit
+as data, and :mod:`sq_perception.fitting.quality` for the status and accuracy of the result.
 
 Which course fits
 -----------------
-There are two, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant`.  A model error that is
-given decides: the exact one for 0, else the tolerant one.  Otherwise what is known of the object does:
+There are two courses, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant`.  If a model error
+is given, it decides: exact for 0, tolerant otherwise.  If none is given, what is known of the object decides:
 
-thing       it stands on a plane, or its hull is predicted: tolerant; but the exact course's body if that leaves no more
-            than the noise, sought cheaply, before where readings are fine, else after and from the tolerant one's body
-may stray   neither, but a pinhole camera saw it and noise may hide how it strays from a superquadric: exact; what
-            leaves more than the noise goes on in the tolerant one
-else        such as the thesis' bodies: exact
+thing       It stands on a plane, or its hull is predicted: tolerant, unless a cheap exact search finds a body that
+            leaves no more than the noise: before, where readings are fine, else after, from the tolerant course's body.
+may stray   Neither, but a pinhole camera saw it, and noise may hide how far it strays from a superquadric: exact; a
+            body that leaves more than the noise is passed on to the tolerant course.
+else        Such as the bodies of the thesis: exact.
 
-Bodies of the first two kinds have the deviations of things, whichever course found them.
+Objects of the first two kinds get the standard deviations of things, whichever course found their bodies.
 
 Frames and units: optical frame, metres, radians.
 """
@@ -51,20 +51,21 @@ from sq_perception.imaging.regions import box, fills
 __all__ = ["FitOptions", "fit", "warm_up"]
 
 _FINE_NOISE = 0.1
-"""Of what things stray from superquadrics: under less noise the exact course goes first, as what the tolerant one
-leaves of a true superquadric may then be more than the noise.  Under more, true superquadrics were left 0.5 to 0.8 of
-it, and things of benchmarks/household_things 1.2 and more."""
+"""Noise, as a share of how far things stray from superquadrics, below which the exact course goes first: the tolerant
+one may then leave more than the noise even of a true superquadric.  Under more, it left 0.5 to 0.8 of the noise on true
+superquadrics, and 1.2 and more on things of benchmarks/household_things."""
 _MODEL_SHARE = 0.04
-"""How far a small thing may stray, as a share of the side of a square as large as what is seen of it: of 6 cm and more
-things of a household stray by :data:`~sq_perception.fitting.options.MODEL_ERROR`, and no more."""
+"""How far a small thing may stray, as a share of the side of a square whose area is that of its pixels: household
+things of 6 cm and more stray by :data:`~sq_perception.fitting.options.MODEL_ERROR`, and no more."""
 _NOISE_ALONE = 1.06
 """Mean squared residual up to which a thing is taken for a superquadric.  19 in 20 superquadrics under independent
-noise left less.  Things that left more were worse by the exact course; of a time-of-flight camera, whose edges mix,
-nearly all do."""
+noise left less.  Things that left more got worse bodies from the exact course; under a time-of-flight camera, which
+mixes depths at edges, nearly all do."""
 _AS_A_THING = 0.5
-"""Weight of the tolerant course's body beside an exact one: noise that a superquadric explains hides how a thing strays
-from one.  Chosen; of 217 things of benchmarks/household_things (60 scenes from seed 54200 on) under 10 mm of noise 11 %
-of the half sizes of converged bodies erred by more than three deviations, with it 3 %."""
+"""Weight of the tolerant course's body as an alternative to an exact one: noise hides how far a thing that a
+superquadric explains strays from one.  Chosen: on 217 things of benchmarks/household_things (60 scenes from seed 54200
+on) under 10 mm of noise, 11 % of the half sizes of converged bodies erred by more than three standard deviations, with
+this weight 3 %."""
 
 
 def fit(
@@ -85,15 +86,15 @@ def fit(
         Pixels of the object.
     camera : Camera
     start : "auto", one body, a batch of bodies or a sequence of bodies, in the optical frame
-        Where to begin.  A function that returns them is not called where the cheapest automatic starts explain the
-        image down to a fine noise: for starts that cost time.
+        Where to begin.  A function that returns starts, meant for those that cost time, is not called where the
+        cheapest automatic ones explain the image down to a fine noise.
     options : FitOptions
 
     Returns
     -------
     Fit
         Hard images give status FAILED with a best-effort box.  The body is always finite; the covariance of a failed
-        fit, and of one that time ended far above the noise, may be NaN.
+        fit, and of one that the time budget ended far above the noise, may be NaN.
 
     Raises
     ------
@@ -120,18 +121,18 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """An object that is to be fitted, and what its course depends on.
+    """An object to fit, and what the choice of its course depends on.
 
     Attributes
     ----------
     depth, mask, camera
     crop
-        What of them is near the object.
+        The part of these images that is near the object.
     options
     given, later
-        Where to begin; ``later`` returns the starts where they cost time.
+        The caller's starts; ``later`` returns those that cost time.
     began
-        Of :func:`time.perf_counter`.
+        When the fit began, by :func:`time.perf_counter`.
     """
 
     depth: np.ndarray
@@ -164,12 +165,12 @@ class _Task:
 
     @property
     def is_fine(self) -> bool:
-        """Whether the noise is so far below what things stray that it hides nothing of it."""
+        """Whether the noise is too small to hide how far things stray."""
         return self.crop.noise.sigma < _FINE_NOISE * self.model_error
 
     @property
     def may_stray(self) -> bool:
-        """Whether the object may be a thing though nobody says so: what a camera measured mostly is one."""
+        """Whether the object may be a thing though the caller does not say so, as most objects before a camera are."""
         return self.camera.is_pinhole and not self.is_fine and not self.fills_image
 
     @cached_property
@@ -182,7 +183,7 @@ class _Task:
 
 
 def _undecided(task: _Task) -> Solution | None:
-    """By the course that explains the object, see the module; None if no body can be fitted to it."""
+    """The solution by the course that explains the object, see the module; None if no body can be fitted to it."""
     options = task.options
     exact_first = task.later is not None if options.plane is None else task.is_fine
     if exact_first:
@@ -196,7 +197,7 @@ def _undecided(task: _Task) -> Solution | None:
         if solution is not None and task.may_stray:
             return _as_thing(solution) or _strayed(task, solution)
         return solution
-    # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
+    # Tolerant first, without a plane too: an exact search from all starts takes six times as long and gains nothing
     # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
     solution = _solved(task, task.of_things)
     was_tried = options.plane is not None and task.is_fine
@@ -207,7 +208,7 @@ def _undecided(task: _Task) -> Solution | None:
 
 
 def _solved(task: _Task, options: FitOptions) -> Solution | None:
-    """By the course of a model error; None if no body can be fitted."""
+    """The solution by the course for the model error of the options; None if no body can be fitted."""
     observation = task.observed(options)
     if _hopeless(observation):
         return None
@@ -216,7 +217,7 @@ def _solved(task: _Task, options: FitOptions) -> Solution | None:
 
 
 def _exactly(task: _Task, given: list[State], later: Callable[[], list[State]] | None) -> Solution | None:
-    """The body that explains the image down to its noise, if one is cheaply found."""
+    """The exact solution that explains the image down to its noise; None if a cheap search finds none."""
     options = replace(task.options, model_error=0.0)
     observation = task.observed(options)
     if _hopeless(observation):
@@ -225,16 +226,16 @@ def _exactly(task: _Task, given: list[State], later: Callable[[], list[State]] |
 
 
 def _as_thing(exactly: Solution | None) -> Solution | None:
-    """What the exact course found of a thing, with the deviations of things; None if it leaves more than the noise."""
+    """The exact solution with the standard deviations of things; None if it leaves more than the noise."""
     if exactly is None or exactly.state.cost >= _NOISE_ALONE * exactly.rays.weight:
         return None
     return replace(exactly, spread_factor=tolerant.SPREAD)
 
 
 def _strayed(task: _Task, exactly: Solution) -> Solution:
-    """What the tolerant course makes of an object of which the exact one left more than the noise."""
+    """The tolerant solution for an object of which the exact course left more than the noise."""
     problem = exactly.problem
-    if exactly.spread_factor > 1 or problem.late:  # it is of that course already
+    if exactly.spread_factor > 1 or problem.late:  # the tolerant course was reached already, or time is up
         return replace(exactly, spread_factor=tolerant.SPREAD)
     options = task.of_things
     strayed = replace(Problem.of(task.observed(options), options, 0.0), deadline=problem.deadline)
@@ -242,12 +243,12 @@ def _strayed(task: _Task, exactly: Solution) -> Solution:
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:
-    """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
+    """Whether a tolerant solution leaves less than the noise, so that an exact one may exist."""
     return deviation(np.abs(solution.distances)) < noise
 
 
 def _or_else(exactly: Solution, thing: State) -> Solution:
-    """The same, with what the tolerant course makes of it as another body that the image allows."""
+    """The exact solution, with the tolerant course's body as another one that the image allows."""
     return replace(exactly, alternatives=(*exactly.alternatives, Alternative(thing, _AS_A_THING)))
 
 

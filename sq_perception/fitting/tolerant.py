@@ -2,30 +2,30 @@
 
 One maximum a posteriori fit.  The cost, minus twice the log of the posterior, is the sum of
 
-    object  w rho(r)        what the object's pixels measured; sigma is the noise and the model error in squares
-    free    w rho(r)        pixels beside it that saw farther: the body keeps out
-    plane, rest             it does not reach below its support, and mostly lies on a face
-    hull                    |W (h - b)|^2: its support function beside the predicted one, W by the misfit m
+    object  w rho(r)        what the object's pixels measured; sigma joins noise and model error in squares
+    free    w rho(r)        pixels beside the object that saw farther keep the body out
+    plane, rest             the body does not reach below its support, and mostly lies on a face
+    hull                    |W (h - b)|^2: support function h against the predicted b; W depends on the misfit m
     volume, proportion      weak, and only where nothing is predicted (:mod:`sq_perception.fitting.unseen` then too)
 
-(:mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors`, :mod:`sq_perception.fitting.hull_prior`).
-Errors of neighbouring pixels are alike where the model errs: the object counts as few independent rays, however many
-are drawn.
+See :mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors` and
+:mod:`sq_perception.fitting.hull_prior`.  Where the model errs, neighbouring pixels err alike: the object counts as few
+independent rays, however many are drawn.
 
-Where a hull is predicted, the body is fitted as the thing's hull, which encloses lids below a rim, necks and handles:
-points behind its surface count by Cauchy's loss, and the space within the outline's convex hull may be empty.  The
+Where a hull is predicted, the body is fitted to the thing's convex hull, which encloses lids below a rim, necks and
+handles: points behind the surface count by Cauchy's loss, and space within the outline's convex hull may be empty.  The
 object then counts as INDEPENDENT_OF_PREDICTED / m rays, m = max(1, c / EXPLAINED), c their mean loss: the variance of
-the model's error is not known beforehand, and the likelihood that is largest over it divides by what is found.  And the
-more it misfits, the more the body is drawn to the predicted hull
-(:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`), its edges most of all.  That pull makes the body no surer,
-and its rays count as fewer by m once more: what errs more does so over larger parts, a neck, a spout, a dent.
+the model's error is not known beforehand, and the likelihood maximised over it divides by the variance found.  The more
+the body misfits, the more it is drawn to the predicted hull (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`),
+its edges most of all.  That pull does not count towards the covariance, and there the rays count as fewer by m once
+more: larger errors extend over larger parts, such as a neck, a spout or a dent.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
 2. A few steps from each on few rays; more from the best, which determines c.
-3. To the end, on all rays, from the best one or two.
-4. Without a prediction: what is hollow or notched, once more as its convex hull; and all the same as a body of
-   revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).  Beside a predicted hull it is not tried:
-   on benchmarks/household_things it cost tools 12 % of IoU, and gained no other kind 1 %.
+3. Convergence on all rays from the best one or two.
+4. Without a prediction: a hollow or notched object is fitted once more as its convex hull; and every object also as a
+   body of revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).  Beside a predicted hull the latter
+   is not tried: on benchmarks/household_things it cost tools 12 % of IoU, and gained no other kind 1 %.
 
 Metres, radians, optical frame.
 """
@@ -58,20 +58,21 @@ from sq_perception.fitting.starts import on_plane, principal
 from sq_perception.geometry.quantiles import deviation
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
-"""Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
+"""Most rays that an object counts as beside a predicted hull, and the mean loss up to which it does: what cartons and
 cans leave.  Chosen on benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the other way."""
 _KEPT = 2
 """Starts that go on from the first few steps.  More changed nothing on benchmarks/household_things, and neither did
 boxes that are deeper than what was seen."""
 _INNER_CAUCHY = 1.0
-"""Noise levels behind the surface of a hull, beyond which a point hardly counts."""
+"""Scale of Cauchy's loss: noise levels behind the surface beyond which a point hardly counts."""
 _AS_HULL = ("like the convex hull of the object",)
 SPREAD = 2.5**2
-"""Factor of the covariance for things that are no superquadrics, whose errors are alike.  Beside a predicted hull the
-misfit and the distance to the hull say how much, each thing by itself: on 600 things of benchmarks/household_things,
+"""Factor of the covariance for things that are no superquadrics, as their residuals err alike.  Beside a predicted hull
+the misfit and the distance to the hull of each thing take its place: on 600 things of benchmarks/household_things,
 seeds from 3000, sigma and error then rank more alike (0.65, 0.57 with the factor), at two thirds of the sigma."""
 _HUBER = 1.0
-"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle."""
+"""Noise levels up to which Huber's loss is quadratic: what strays farther is another part of the thing: a neck, a
+handle."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
@@ -114,13 +115,13 @@ def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
-    """Of the object's rays: c of the module."""
+    """Mean loss of the object's rays: c of the module."""
     rays = problem.observation.object_rays(SAMPLE, 0.1)
     return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
 
 
 def _typical_of_hollow(problem: Problem) -> float:
-    """Loss of points that stray as far as noise does at the most: a bowl's or a pair of pliers' typically do."""
+    """Huber's loss of a point as far off as noise reaches at most: a bowl's or a pair of pliers' typically have it."""
     return problem.terms.huber * (2 * INLIER - problem.terms.huber)
 
 
@@ -134,7 +135,7 @@ def _hollow_as_hull(solution: Solution, starts: Sequence[State]) -> Solution:
 
 
 def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution:
-    """The same where an exact body was sought in vain: what ``best`` leaves becomes the model error."""
+    """The most probable body where an exact one was sought in vain: what ``best`` leaves becomes the model error."""
     hits = problem.observation.object_rays(FINAL_RAYS)
     left_over = deviation(np.abs(surface_distance(hits, best.parameters, best.rotation)))
     observation = problem.observation
@@ -152,7 +153,7 @@ def _with_priors(problem: Problem) -> Problem:
         inner_cauchy=_INNER_CAUCHY,
         proportion_stiffness=0.0,
         volume_price=0.0,
-        # Neither read only nor of single precision: another form to compile.
+        # Writable and of double precision: kernels would be compiled again for other arrays.
         hull_directions=np.array(hull.directions, float, order="C"),
         hull_support=np.array(hull.support, float, order="C"),
         hull_root=hull.root(),
