@@ -19,7 +19,7 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 
 STEP_LENGTH = 11
 LANES = 64
-"""Residuals of a block: eight of the longest vectors, and all rows stay in the nearest cache (6 of 32 KiB and more)."""
+"""Residuals of a block: eight of the longest vectors, with all rows in the nearest cache (6 of its 32 KiB or more)."""
 _SMALL = 1e-300
 _LN_2 = math.log(2.0)
 

@@ -1,8 +1,8 @@
-"""How far a depth image can be trusted: the standard deviation of its noise, estimated.
+"""An estimate of the standard deviation of a depth image's noise.
 
-Third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope and
-curvature; their median absolute value over the mask, times 1.4826 / sqrt(20), is sigma.  Quantisation with step q
-adds q^2 / 12 at least; q is the smallest depth difference that occurs.  It holds for the object as a whole.
+Third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope and curvature;
+their median absolute value over the mask, times 1.4826 / sqrt(20), is sigma.  Quantisation with step q adds q^2 / 12 at
+least; q is the smallest depth difference that occurs.  The estimate holds for the object as a whole.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
 
 _SAMPLES = 1500
-"""Of differences: their median is then known to 3 %."""
+"""Third differences that are taken, about: their median is then known to 3 %."""
 _FEWEST = 8
-"""Differences that it takes: with fewer, one edge within the mask is the median."""
+"""Fewest differences for an estimate: with fewer, one edge within the mask is the median."""
 
 
 class DepthNoise(NamedTuple):

@@ -1,4 +1,4 @@
-"""What a fit answers: the body, how well it explains the image, and how sure it is."""
+"""The result of a fit: the body, how well it explains the image, and how sure it is."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from sq_perception.geometry.superquadric import Superquadric
 
 INLIER = 3.0
-"""Noise levels: noise alone stays within for 99.7 % of the pixels."""
+"""Noise levels up to which a pixel is an inlier: noise alone stays within for 99.7 % of the pixels."""
 FAILED_SHARE = 0.25
-"""Of the smallest half size: a body that half of the points miss by more describes none of its faces."""
+"""Share of the smallest half size: a body that half of the points miss by more describes none of its faces."""
 CUT_SHORT = "cut short by the time budget"
-"""In the message of a body whose fit had to end before it was done."""
+"""Part of the message of a fit that the time budget ended before it was done."""
 
 
 class Status(IntEnum):
@@ -45,19 +45,19 @@ class Fit:
         Standard deviation of the depth noise, estimated or given, joined in squares by how far a thing may stray from a
         superquadric, metres.
     inlier_share
-        Share of the object's pixels within three such deviations of the surface, 0 to 1.
+        Share of the object's pixels within three of these standard deviations of the surface, 0 to 1.
     seen
         (3,) share of each full size that the measured points span along its axis, 0 to 1: the rest is inferred, from
         free space, the support plane, symmetry and what bodies mostly are.
     covariance
         (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
     iterations, milliseconds
-        What it cost.
+        What the fit cost.
     is_predicted
-        Whether a predicted hull weighs in: it errs alike in all views of the thing.
+        Whether a predicted hull weighs in, which errs alike in all views of the thing.
     as_hull
-        Whether no superquadric came near, so that the body was fitted as to the convex hull of the object: what the
-        camera saw to be empty within the hull of the outline was let go.
+        Whether no superquadric came near, so that the body was fitted to the convex hull of the object: space within
+        the hull of the outline that the camera saw to be empty does not count.
     """
 
     superquadric: Superquadric

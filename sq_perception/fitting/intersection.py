@@ -1,8 +1,8 @@
 """Rays and a superquadric, a block of rays at a time: where they meet it, and how near they pass; compiled.
 
-A block is an array ``lanes`` (ROWS, LANES), a ray a column, its values in the rows named below, in the object frame.
-Every line of the mathematics is a loop over the block without a branch, which the compiler turns into vector code.  A
-number of lanes is a multiple of the length of a vector (:func:`padded`): a lane by itself takes as long as eight.
+A block is an array ``lanes`` (ROWS, LANES), one ray per column, its values in the rows named below, in the object
+frame.  Every line of the mathematics is a loop over the block without a branch, which the compiler turns into vector
+code.  Lanes in use are a multiple of a vector's length (:func:`padded`): one lane takes as long as eight.
 
 The gauge g is convex along a ray.  Where the ray enters the body, g = 1 with a falling slope, is found by Newton's
 method; how near a ray that misses passes, by a bracket around the smallest g.
@@ -19,32 +19,32 @@ from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, OR
 from sq_perception.geometry.kernels import box_interval, gauge_derivatives, in_object_frame, inline_kernel, kernel
 
 QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)
-"""A ray in the object frame, q + shift e;"""
+"""Rows of a ray in the object frame, q + shift e."""
 G, GX, GY, GZ, G1, G2, SLOPE = range(7, 14)
-"""the gauge there and its derivatives, the last one along the ray;"""
+"""Rows of the gauge there and its derivatives, the last one along the ray."""
 MEASURED, PRECISION, SHARE, START = range(14, 18)
-"""what the pixel measured, 1 / sigma and weight of the ray, and the depth of q;"""
+"""Rows of what the pixel measured, 1 / sigma and weight of the ray, and the depth of q."""
 LOW, HIGH, G_LOW, G_HIGH, S_LOW, S_HIGH = range(18, 24)
-"""a bracket around the smallest gauge."""
+"""Rows of a bracket around the smallest gauge."""
 ROWS = 24
 _VECTOR = 8
 """Doubles of the longest vectors of today's processors, 512 bits."""
 
 _HIT_STEPS = 12
-"""Of Newton's method on a convex function; it converges quadratically, most rays need 2."""
+"""Most steps of Newton's method on a convex function; it converges quadratically, most rays need 2."""
 _LOWEST_STEPS, LOWEST_TOLERANCE = 20, 1e-9
-"""Most steps to the smallest gauge on a ray, and how near to a lower bound it ends."""
+"""Most steps to the smallest gauge on a ray, and how near to a lower bound of it they end."""
 _ANY, _COVERED_TOLERANCE = 1e300, 1e-6
-"""The same for a ray that should meet the body but misses it: how far it passes always matters."""
+"""Gauge that matters, and tolerance, for a ray that should meet the body but misses it: any distance matters."""
 _NEAREST = 1e-3
-"""A free ray starts this far in front of a pinhole camera, metres."""
+"""Distance in front of a pinhole camera at which a free ray starts, metres."""
 _FAR_OUTSIDE = 2.0
-"""From a gauge above this, Newton's method starts where the ray enters the bounding box instead."""
+"""Gauge above which Newton's method starts where the ray enters the bounding box instead."""
 
 
 @kernel
 def place(part: np.ndarray, resume: bool, parameters: np.ndarray, rotation: np.ndarray, lanes: np.ndarray) -> None:
-    """Rays of the object, in its frame; q at the measured depth, or where the ray met the body last time."""
+    """Write object rays, in the object frame, to the lanes; q at the measured depth, or where it met the body last."""
     t1, t2, t3 = parameters[5], parameters[6], parameters[7]
     m11, m12, m13 = rotation[0]
     m21, m22, m23 = rotation[1]
@@ -77,7 +77,7 @@ def padded(count: int, lanes: np.ndarray) -> int:
 
 @kernel
 def gauge_along(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
-    """The gauge and its derivatives at q + shift e."""
+    """Write the gauge and its derivatives at q + shift e to the lanes."""
     a1, a2, a3, e1, e2 = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
     for i in range(filled):
         ex, ey, ez, shift = lanes[EX, i], lanes[EY, i], lanes[EZ, i], lanes[SHIFT, i]
@@ -92,7 +92,7 @@ def gauge_along(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
 def meet(
     filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray, again: np.ndarray
 ) -> None:
-    """Where the rays meet the surface: shift along the ray and the gauge there; ``missed`` where they do not.
+    """Find where the rays meet the surface: shift along the ray and the gauge there; ``missed`` where they do not.
 
     Newton's method along the ray.  From a point on the near side of the body it cannot fail, as g is convex along the
     ray; from the far side, from far outside, and where it passes the smallest g, it starts again at the bounding box.
@@ -134,7 +134,8 @@ def meet(
 
 @kernel
 def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> None:
-    """The same from where the rays enter the bounding box; SHARE says whether one meets the surface, 1 or 0."""
+    """As :func:`meet`, from where the rays enter the bounding box; SHARE is 1 for rays that meet the surface, else
+    0."""
     for i in range(filled):
         qx, qy, qz = lanes[QX, i], lanes[QY, i], lanes[QZ, i]
         ex, ey, ez = lanes[EX, i], lanes[EY, i], lanes[EZ, i]
@@ -191,7 +192,7 @@ def enter(
 def lowest(
     filled: int, matters: float, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray
 ) -> None:
-    """The smallest gauge on each ray between LOW and HIGH, as far as it matters: shift and gauge there.
+    """Find the smallest gauge on each ray between LOW and HIGH, as far as it matters: shift and gauge there.
 
     Convexity brackets the minimum between two tangents; their intersection is a lower bound, and the search of a ray
     ends once that is above ``matters`` (``missed``) or within the tolerance of the best point.  The next point is the

@@ -22,15 +22,15 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.superquadric import Superquadric
 
 _LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
-"""Of one step: beyond, residuals are no longer linear.  A shift is limited to the largest half size."""
+"""Largest changes in one step: beyond, residuals are no longer linear.  A shift is limited to the largest half size."""
 _FIRST_DAMPING = 1e-3
-"""Times the diagonal: tau of Madsen et al. for starts that are believed to be good."""
+"""First lambda: tau of Madsen et al. for starts that are believed to be good."""
 _WORSE, _BETTER = 7.0, 0.12
 """Factors of the damping after a step that was refused and one that was taken."""
 _ATTEMPTS = 6
 """Steps refused in a row, damping growing 10^5 fold, before the search ends."""
 _LEAST_COST = 1e-12
-"""Of which a gain is a share: a body that leaves nothing at all has none to go on for."""
+"""Least cost that a gain is taken as a share of: a body that leaves nothing at all has no gain to go on for."""
 
 
 class State(NamedTuple):
@@ -47,7 +47,7 @@ class State(NamedTuple):
 
     @classmethod
     def of(cls, body: Superquadric) -> State:
-        """A single body, its cost unknown."""
+        """The state of a single body, its cost unknown."""
         flat = np.array(body.to_flat(), dtype=float)
         return cls(flat[:8], np.ascontiguousarray(body.rotation_matrix, dtype=float), math.inf, 0)
 
@@ -124,7 +124,7 @@ def _promised(sums: np.ndarray, step: np.ndarray) -> float:
 
 @kernel
 def _hold(parameters: np.ndarray, lower: np.ndarray, upper: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> None:
-    """Mark what sits on a bound and would be pushed beyond it."""
+    """Mark the parameters that sit on a bound and would be pushed beyond it."""
     for k in range(8):
         slack = 1e-12 * max(abs(lower[k]), abs(upper[k]))
         at_lower = parameters[k] <= lower[k] + slack and gradient[k] > 0.0

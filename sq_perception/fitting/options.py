@@ -16,11 +16,11 @@ SMALLEST_SIZE = 0.02
 LARGEST_SIZE = 2.0
 """Largest size, likewise: a body may hide as much again as it shows."""
 EXPONENTS = (0.1, 1.0)
-"""Of a fit: from boxes to ellipsoids, as in the thesis."""
+"""Least and largest exponent of a fit: from boxes to ellipsoids, as in the thesis."""
 MIN_PIXELS = 12
-"""A body has 11 parameters."""
+"""Fewest pixels of an object with a depth: a body has 11 parameters."""
 MODEL_ERROR = 0.0025
-"""Real objects are no superquadrics; on tables of everyday things this is how far they stray, metres."""
+"""How far real objects stray from superquadrics on tables of everyday things, metres."""
 
 
 def limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -43,9 +43,9 @@ class FitOptions:
     noise
         Standard deviation of the depth noise, metres; None estimates it from the image.
     model_error
-        How far the object may stray from a superquadric, metres.  None: 0 if a superquadric explains the image down
-        to its noise, else 2.5 mm for objects on a plane, with a predicted hull, or that one all but explains, less for
-        those of which less than 6 cm are seen, what is left over for others.
+        How far the object may stray from a superquadric, metres.  None: 0 if a superquadric explains the image down to
+        its noise; else 2.5 mm for objects on a plane, with a predicted hull, or all but explained by a superquadric,
+        less where less than 6 cm of them are seen; for others what the best superquadric leaves over.
     plane
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.  It is taken at its word: a
@@ -59,7 +59,7 @@ class FitOptions:
         it: asked for only where no superquadric explains the image down to its noise.
     nan_is_empty
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
-        farther; if not, it is unknown.  None: as the image has it, see :mod:`sq_perception.fitting.observation`.
+        farther; if not, it is unknown.  None: decided by the image, see :mod:`sq_perception.fitting.observation`.
     pixels
         Budget of object rays in the last stage; a quarter as many free rays come on top.  None: enough that noise
         averages out.

@@ -1,8 +1,8 @@
 """The outline of a body against the mask's: whether the mask shrank, and how exact the outline is.
 
-Free rays beside the mask show where the body ends.  If something ate the mask's edge (sensors lose what they see at
-grazing angles), all around it the body covers pixels that were taken for free: those are let go.  What the body then
-still covers determines the standard deviation of the outline.
+Free rays beside the mask show where the body ends.  If the mask lost its edge (sensors lose what they see at grazing
+angles), the body covers pixels that were taken for free all around it: those are left out.  What the body then still
+covers determines the standard deviation of the outline.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _SHARP = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels, a
 uniform error of up to half a pixel (1 / sqrt(12))."""
 _SHRUNK = 0.25
-"""A body that covers half of the free pixels beside the mask this deep, in pixels, is larger than its mask."""
+"""Depth, in pixels: a body that covers half of the free pixels beside the mask this deep is larger than its mask."""
 _SHARPER = 0.7
-"""How much smaller than the one before a reading of the outline's precision has to be for another one."""
+"""Factor of the last estimate of the outline's standard deviation that a new one must fall below for another round."""
 
 
 def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -41,9 +41,9 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
 
 
 def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
-    """Read the outline's precision from a body's misfit to free rays, and again from the better body it allows.
+    """Estimate the outline's precision from a body's misfit to free rays, and again from the better body it allows.
 
-    It is no less than what was known before: pixels that miss a body would cost next to nothing, and it might leave.
+    The precision does not fall: else pixels that miss a body would cost next to nothing, and it might leave them.
     """
     state, sigma = _pulled_in(problem, state, free, rays)
     before = math.inf
@@ -57,8 +57,8 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
 
 
 def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
-    """A body that sticks out farther than was known before, in its outline to a pixel if it fits in there; and how far
-    the one returned sticks out."""
+    """The body, refitted with its outline known to a pixel if it sticks out farther than assumed and that helps; and
+    how far the one returned sticks out, metres."""
     sigma = _sigma(problem, state, free)
     if not sigma > problem.observation.outline or problem.late:
         return state, sigma

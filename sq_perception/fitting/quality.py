@@ -16,11 +16,12 @@ from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
 _REACHED = 0.9
-"""Of the points of a thing that was fitted as a hull: how far the rest sticks out decides whether it is enclosed."""
+"""Share of the points of a thing fitted as a hull: how far the rest sticks out decides whether it is enclosed."""
 _ENCLOSED_SHARE = 1.0
-"""Of the middle half size: a body that encloses a thing but for a trigger, a spout or a rim is one that a planner can
-use with care.  Of 3582 things of benchmarks/household_things ten well measured ones left more than the smallest half
-size of their hull: seven of them less than this, of IoU 0.33 to 0.80, and three more, of 0.24 to 0.43."""
+"""Share of the middle half size by which points may stick out of a hull: a body that encloses a thing but for a
+trigger, a spout or a rim is one that a planner can use with care.  Of 3582 things of benchmarks/household_things ten
+well measured ones left more than the smallest half size of their hull: seven less than this, of IoU 0.33 to 0.80, and
+three more, of 0.24 to 0.43."""
 _UNFINISHED = "how far it is off is not known"
 _AXES = "xyz"
 
@@ -32,7 +33,7 @@ def assessed(solution: Solution, began: float) -> Fit:
     covariance = solution.covariance + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
-    if solution.is_unfinished:  # it is that of the lowest point of a valley, where the body is not
+    if solution.is_unfinished:  # it holds at the lowest point of a valley, where the body is not
         covariance = np.full_like(covariance, np.nan)
     typical = quantile(np.abs(solution.distances), 0.5)
     residual, inlier_share = _within(solution.distances, INLIER * observation.sigma, INLIER * typical)
@@ -80,7 +81,7 @@ def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
 
 
 def failed(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
-    """No fit, but a box around what was seen."""
+    """The result where no body can be fitted: a box around what was seen."""
     points = observation.points
     distance = np.abs(body.sampson_distance(points))
     return Fit(
@@ -99,11 +100,11 @@ def status(
 ) -> tuple[Status, str]:
     """The status and its reason, without lengths: only the reader of the image knows their unit.
 
-    Points miss the body typically by ``typical`` metres, or stick out of one like the hull so far; ``sigma`` is the
-    noise and the model error, metres, ``covariance`` (11, 11).
+    ``typical`` is how far points typically miss the body, or stick out of one fitted as a hull, metres; ``sigma`` is
+    the noise and the model error, metres, ``covariance`` (11, 11).
     """
     smallest = float(body.size.min())
-    # Of a plate or a pen, a quarter of the thickness is less than what any thing strays.
+    # A quarter of the thickness of a plate or a pen is less than any thing strays.
     strays = max(FAILED_SHARE * smallest, INLIER * sigma)
     bearable = max(strays, _ENCLOSED_SHARE * float(np.median(body.size))) if as_hull else strays
     off = f"many of the points lie {typical / smallest:.0%} of its smallest half size and more off"

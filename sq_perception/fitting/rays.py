@@ -22,16 +22,16 @@ metres: where the ray met the body last time, which is where the next search for
 """
 RAY_COLUMNS = 8
 SAMPLE = 800
-"""Rays that determine a mean, a share or a median of the object's to 1 to 3 %, and take a tenth of a fit's time."""
+"""Object rays that determine a mean, a share or a median to 1 to 3 %, and take a tenth of a fit's time."""
 
 
 class Rays(NamedTuple):
     """The rays that one stage of a fit draws."""
 
     hits: np.ndarray
-    """(n, 8), pixels of the object."""
+    """Rays (n, 8) of the object's pixels."""
     free: np.ndarray
-    """(m, 8), pixels beside it."""
+    """Rays (m, 8) of pixels beside the object."""
 
     @property
     def weight(self) -> float:
@@ -80,7 +80,7 @@ def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> n
 def through(
     pixels: np.ndarray, depth: np.ndarray, lens: Lens, noise: float, model_error: float, margin: float
 ) -> np.ndarray:
-    """Rays (n, 8) through pixels, indices into the depth image; object rays, or free ones that end a margin before.
+    """Rays (n, 8) through pixels, indices into the depth image; free ones end a margin before the reading.
 
     Noise and model error join in squares; ``margin``: in such standard deviations, 0 for rays of the object.
     """

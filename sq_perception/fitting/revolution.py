@@ -1,15 +1,15 @@
 """Bodies of revolution: the simpler family that many things of a household belong to, tried where a side is unseen.
 
-A can, a bottle, a bowl or a fruit shows half of its mantle.  As any superquadric its depth stays open; as a body of
-revolution, a1 = a2 and e2 = 1, the half that is seen determines the other one.  The family has 3 parameters less:
-one half size, one exponent, and the turn about z.  By the Bayesian information criterion (G. Schwarz, Annals of
+A can, a bottle, a bowl or a fruit shows half of its mantle.  Fitted as any superquadric, its depth stays open; as a
+body of revolution, a1 = a2 and e2 = 1, the half that is seen determines the other one.  The family has 3 parameters
+less: one half size, one exponent, and the turn about z.  By the Bayesian information criterion (G. Schwarz, Annals of
 Statistics 6(2), 1978), and as more things are round than of any one oval shape, it is the better description if
 
     D(cost(round)) < D(cost(free)) + 3 log W + 2 log ODDS,    D(c) = c for c <= W,  W + W log(c / W) above,
 
 W the total weight of the object's rays, the number of independent residuals that the cost stands for.  D is twice the
-negative log likelihood with variance max(1, c / W): where no superquadric explains a bottle with its neck, what is left
-over is no reason to prefer the body that happens to leave less.  Both readings stay with the weights that follow,
+negative log likelihood with variance max(1, c / W): where no superquadric explains a bottle with its neck, the rest is
+no reason to prefer the body that happens to leave less.  Both readings stay with the weights that follow,
 exp(-difference / 2), and what they disagree about widens the covariance.
 
 Metres, optical frame; costs are those of :mod:`sq_perception.fitting.residuals`.
@@ -36,19 +36,19 @@ from sq_perception.fitting.starts import ORDERS, standing_axes
 from sq_perception.geometry import rotation as quaternions
 
 SPARED = 3
-"""Parameters that a body of revolution has less."""
+"""Number of parameters that a body of revolution has less than any superquadric."""
 ODDS = 3.0
-"""Of the things whose unseen side is in question, so many more are round than any other one oval shape."""
+"""How many times more of the things whose unseen side is in question are round than have any one oval shape."""
 SIGMA = 0.01
-"""Of log(a1 / a2) and of 1 - e2: how exactly round."""
+"""Standard deviation of log(a1 / a2) and of 1 - e2: how exactly round."""
 _FINALISTS = 2
 """Round bodies that go on from the few steps on few rays."""
 _START_EXPONENT = 0.4
-"""Of a start: between a can's and a fruit's."""
+"""Exponent e1 of a start: between a can's and a fruit's."""
 
 
 def weighed(solution: Solution) -> Solution:
-    """The body of revolution where it describes the image better."""
+    """The solution, replaced by a body of revolution where that describes the image better."""
     problem, free, rays = solution.problem, solution.state, solution.rays
     round_ = problem.with_terms(roundness_stiffness=1 / SIGMA)
     starts = from_body(free)
@@ -127,7 +127,7 @@ def _round(
     away: np.ndarray,
     nearest: float,
 ) -> State:
-    """A round body about ``axis``: what it spans along that and ``side``, and where it begins going ``away``."""
+    """A round body that spans ``along`` the axis and ``across`` along ``side``, and begins at ``nearest`` ``away``."""
     radius = max(float(0.5 * (across[1] - across[0])), 1e-4)
     half = max(float(0.5 * (along[1] - along[0])), 1e-4)
     centre = 0.5 * (along[0] + along[1]) * axis + 0.5 * (across[0] + across[1]) * side + (nearest + radius) * away

@@ -20,7 +20,7 @@ _ALIKE = 0.01
 
 
 def alike(state: State, other: State) -> bool:
-    """Whether two searches ended in the same valley, in the same of the body's forms or with the same sizes."""
+    """Whether two searches ended in the same valley: at about the same cost and sizes, in any of a body's forms."""
     if abs(state.cost - other.cost) > SIGNIFICANT:
         return False
     sizes = np.abs(np.sort(state.parameters[:3]) - np.sort(other.parameters[:3]))
@@ -43,7 +43,7 @@ def _turned(state: State) -> State:
 
 
 def other_orders(state: State) -> list[State]:
-    """The same box with each of its other axes as z."""
+    """Bodies of the same box with each of its other axes as z."""
     found = []
     for order in starts.three_orders(np.eye(3))[:2]:
         parameters = state.parameters.copy()
@@ -54,7 +54,7 @@ def other_orders(state: State) -> list[State]:
 
 
 def other_axes(state: State) -> list[State]:
-    """The same box of axes with each z, and turned by 45 degrees about each axis."""
+    """Bodies of the same moments with each axis as z, and turned by 45 degrees about each axis."""
     moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * starts.MOMENT_SHARE) @ state.rotation.T
     found: list[State] = []
     for axes in [state.rotation, *starts.eighth_turns(state.rotation)]:

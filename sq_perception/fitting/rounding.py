@@ -1,11 +1,10 @@
 """What rounded readings leave open: the half size behind a face that looks at the camera.
 
-A sharp body seen face-on shows its depth only in the last pixels before its outline.  Where readings are whole steps
-q of depth with little noise, all those of the face err alike, by up to q / 2, and least squares takes that error for
-news of the outline.  What is certain is that the true body passes every reading at no more than q / 2.  So the half
-size along the view is held at one value after another, the rest is fitted with residuals that count only beyond q / 2
-(a dead zone), and each value has the weight exp(-cost / 2).  Their mean is the estimate, their spread the standard
-deviation.
+A sharp body seen face-on shows its depth only in the last pixels before its outline.  Where readings are whole steps q
+of depth with little noise, all those of the face err alike, by up to q / 2, and least squares takes that error for
+information on the outline.  The true body certainly passes every reading at no more than q / 2.  So the half size along
+the view is held at one value after another, the rest is fitted with residuals that count only beyond q / 2 (a dead
+zone), and each value has the weight exp(-cost / 2).  Their mean is the estimate, their spread the standard deviation.
 
 Reference for the bounded-error view: M. Milanese, A. Vicino, Optimal estimation theory for dynamic systems with set
 membership uncertainty, Automatica 27(6), 1991.
@@ -25,30 +24,31 @@ from sq_perception.fitting.rays import DEPTH, Rays
 from sq_perception.fitting.rivals import other_orders, resized
 
 _FACE_SHARE = 0.04
-"""A depth that this share of all rays has in common is that of a face."""
+"""Share of all rays that have a depth in common, from which on it is that of a face."""
 _DEAD_ZONE = 0.5 * 1.01
-"""Half a step, and a little for single precision."""
+"""Residual, in steps, up to which it counts as 0: half a step, and a little for single precision."""
 _RAYS = 1000
-"""Of the search for each of up to 21 bodies, which begins at a neighbour's."""
+"""Rays of the search for each of up to 21 bodies, which begins at a neighbour's."""
 _PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
 """Factors from one half size to the next, up and down from the one at hand."""
 _UNLIKELY = 12.0
-"""Where values cost so much more, twice in a row, there is no need to go on,"""
+"""Excess of the cost over the least, twice in a row, at which a walk ends."""
 _ALLOWED = 3.0
-"""unless none at hand is what the readings allow: the true one costs nothing."""
+"""Cost up to which the readings allow a body, without which no walk ends early: the true one costs nothing."""
 _CERTAIN = 0.02
-"""A standard deviation of the log size below this leaves nothing open."""
+"""Standard deviation of the log size below which nothing is open."""
 _OPEN = 0.1
-"""A half size less certain than this share of it: the mean of all bodies replaces the one of least squares."""
+"""Standard deviation of the log size from which on the mean of all bodies replaces that of least squares."""
 _FACE_SPREAD = 1.5
-"""Of the other standard deviations: all readings of a face err alike."""
+"""Factor of the other standard deviations: all readings of a face err alike."""
 _CONTRADICTED = 0.003
-"""Mean squared residual beyond half a step, in units of the noise.  Of 1000 of the thesis' images all but one
-leave 0.0007 at most; a body 3 % too long left 0.01, its mean squared residual was 0.85, the right one's 0.76."""
+"""Mean squared residual beyond half a step, in units of the noise, above which a body is wrong.  Of 1000 of the thesis'
+images all but one leave 0.0007 at most; a body 3 % too long left 0.01, its mean squared residual was 0.85, the right
+one's 0.76."""
 
 
 def spread_along_view(solution: Solution) -> Solution:
-    """Ask for all half sizes along the view that the image allows, where readings are rounded."""
+    """The solution with all half sizes along the view that the image allows, where readings are rounded."""
     quantum = solution.problem.observation.noise.quantum
     if quantum > 0 and faces_camera(solution.rays.hits, quantum):
         best, allowed = plausible(solution)
@@ -83,7 +83,7 @@ def faces_camera(hits: np.ndarray, quantum: float) -> bool:
 
 
 def plausible(solution: Solution) -> tuple[State, list[Alternative]]:
-    """The bodies that the rounded readings allow, none if no other than the given one; and the best of them.
+    """The best body, and those that the rounded readings allow, none if no other than the given one.
 
     The best is the given one, which averages roundings out, as long as the readings hardly leave a size open, else the
     mean of all.
@@ -134,7 +134,7 @@ class _Walk:
         self.paces += np.gradient(sizes).tolist()
 
     def weights(self) -> np.ndarray:
-        """Of the bodies (n,), a uniform density of the log size assumed; they sum to 1."""
+        """Weights (n,) of the bodies for a uniform density of the log size; they sum to 1."""
         cost = np.array([state.cost for state in self.states])
         weights = np.exp(-0.5 * (cost - self.least)) * np.array(self.paces)
         return np.asarray(weights / weights.sum())
@@ -145,7 +145,7 @@ class _Walk:
         return math.sqrt(weights @ (sizes - weights @ sizes) ** 2)
 
     def mean(self) -> State:
-        """The body of the mean log size, from the likeliest near it."""
+        """The body of the mean log size, fitted from the likeliest one near it."""
         weights, sizes = self.weights(), np.array(self.sizes)
         mean = float(weights @ sizes)
         near = np.argsort(np.abs(sizes - mean))[:3]

@@ -12,8 +12,8 @@ Start: an ellipsoid (e1 = e2 = 1) at the centroid of the points, along their pri
 points as its sizes.  The z axis is the principal axis whose moment differs most from the other two: the long axis of a
 long object, the short one of a flat object, and for both the axis of rotational symmetry.
 
-It is the baseline of every comparison and deliberately knows nothing else: no free space, no outline, no noise.  Seen
-from one side, the points fix the visible half only: the centroid lies too near, and hidden extents are a guess.
+The method is the baseline of every comparison and deliberately uses nothing else: no free space, no outline, no noise.
+Seen from one side, the points fix the visible half only: the centroid lies too near, and hidden extents are a guess.
 
 Reference: F. Solina, R. Bajcsy, Recovery of parametric models from range images: the case for superquadrics with global
 deformations, IEEE PAMI 12(2), 1990; A. Jaklic, A. Leonardis, F. Solina, Segmentation and Recovery of Superquadrics,
@@ -38,11 +38,11 @@ from sq_perception.geometry import rotation as quaternions
 
 _NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))
 _UNIT = 0.01
-"""Residuals count in this share of the extent to the power 3/2, which makes the damping independent of units."""
+"""Unit of residuals, as a share of the extent to the power 3/2, which makes the damping independent of units."""
 _MOST_POINTS = 1000
-"""Budget.  Chosen: what the method costs grows with them, what it finds does not."""
+"""Most points that are fitted.  Chosen: the cost of the method grows with their number, its result hardly changes."""
 _MOST_STEPS, _TOLERANCE = 100, 1e-6
-"""Levenberg-Marquardt stops after so many, or when one gains less than this share of the cost.  Chosen: beyond need."""
+"""Most steps of Levenberg-Marquardt, and the gain, as a share of the cost, that ends it.  Chosen: beyond need."""
 _ESCAPE = 0.3
 """Standard deviation of a disturbance: of log sizes, exponents, angles, and of the centre in mean half sizes."""
 
@@ -117,7 +117,7 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
 
 
 def _disturbed(state: State, rng: np.random.Generator) -> State:
-    """Another size, shape, centre and rotation nearby."""
+    """The body with its size, shape, centre and rotation disturbed at random."""
     parameters = state.parameters.copy()
     parameters[0:3] *= np.exp(_ESCAPE * rng.standard_normal(3))
     parameters[3:5] += _ESCAPE * rng.standard_normal(2)

@@ -18,7 +18,7 @@ and the chords together are the whole body: its second moments are M = sum |h| (
 
 The principal axes of M are the axes of the body, up to their order: which one is z is not known, so each is tried.  A
 half size is sqrt(M_kk / 0.27): the share is 0.2 for an ellipsoid, 1/3 for a box.  For pinhole cameras all this holds
-approximately, the better the smaller the body against its distance; it starts an iteration.
+approximately, the better the smaller the body against its distance; an iteration only starts from it.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ from sq_perception.imaging.camera import Lens
 from sq_perception.imaging.lens import point_at
 
 _BOX_EXPONENT = 0.3
-"""Of a box's start, nearer to a box than to an ellipsoid; a few steps find the rest."""
+"""Exponents of a start from a box, nearer to a box than to an ellipsoid; a few steps find the rest."""
 MOMENT_SHARE = 0.27
 START_EXPONENT = 0.5
-"""Both between those of an ellipsoid (0.2, 1) and of a box (1/3, 0)."""
+"""Moment over squared half size, and exponents, of a start: between ellipsoid (0.2, 1) and box (1/3, 0)."""
 _RANK = 4
-"""The centre's depth is the largest mean depth but for this many pairs, in case of a stray pixel."""
+"""Pairs of the largest mean depths that are passed over for the centre's depth, in case of a stray pixel."""
 _MOST_PAIRS = 2500
-"""Enough for second moments to 2 %."""
+"""Pairs that are taken, about: enough for second moments to 2 %."""
 _EIGHTH_TURN = math.pi / 4
 _EXPONENTS = (0.3, 0.8)
-"""Of the last starts of all: between box and ellipsoid, nearer to either."""
+"""Exponents of the last starts of all: between box and ellipsoid, nearer to either."""
 ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 """Which of three right-handed axes are x, y and z, so that each is z once."""
 
@@ -139,7 +139,7 @@ def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]
 
 
 def groups(observation: Observation) -> Iterator[list[State]]:
-    """Starts in the order in which to try them; the points' box where nothing shows the symmetry."""
+    """Groups of starts in the order in which to try them; boxes of the points where nothing shows the symmetry."""
     completed = completed_moments(observation)
     if completed is None:
         yield principal(observation.points)
@@ -152,7 +152,7 @@ def groups(observation: Observation) -> Iterator[list[State]]:
 
 
 def everything(observation: Observation) -> list[State]:
-    """All starts at once, for images on which the first ones failed: boxes, and others than the first exponent."""
+    """All starts at once, for images on which the first ones failed: boxes, and symmetry with several exponents."""
     found = principal(observation.points)
     completed = completed_moments(observation)
     if completed is None:
@@ -180,7 +180,7 @@ def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray]
 
 @kernel
 def _moments(pairs: np.ndarray, centre: np.ndarray, shortest: float) -> np.ndarray:
-    """sum |h| (m m^T + h h^T / 3) / sum |h| over pairs of m and C - h."""
+    """Second moments (3, 3) sum |h| (m m^T + h h^T / 3) / sum |h| over pairs of m and C - h."""
     moments = np.zeros((3, 3))
     total = 0.0
     for i in range(pairs.shape[0]):
@@ -206,7 +206,7 @@ def _opposite_pairs(
 ) -> tuple[float, float, np.ndarray]:
     """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points.
 
-    Of the pairs, those of every ``stride``-th row and column.
+    Only pixels of every ``stride``-th row and column are looked at.
     """
     height, width = depth.shape
     total_u, total_v, count = 0.0, 0.0, 0

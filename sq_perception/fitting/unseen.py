@@ -1,15 +1,15 @@
 """Half sizes that the image leaves open: weighed against what is known beyond it.
 
-Where the image hardly determines a size, small errors of the model would decide it: it is left to the priors, and to
-a prediction where there is one.  The same body competes with that size like its others, thin, and as predicted, its
-seen face in place.
+Where the image hardly determines a size, small errors of the model would decide it: it is left to the priors, and to a
+prediction where there is one.  The body competes with others of which that size is like the other two, thin, or as
+predicted, the seen face in place.
 
 What the border of an image, or of its readings, cuts off is open as well.  A prism, such as a can or a carton, looks
 the same however far it goes on beyond the border.  Its cost has a wall where it would be too short to reach the border,
 and is flat beyond: a search ends at the foot of the wall, whose curvature tells nothing of the flat.  So where the
 border cuts an object and an end of its body lies beyond, the body is also held with that end farther out and the other
 one in place, the rest fitted again.  What the image allows then adds to the covariance, with the weight of the body
-itself.  A predicted hull has no say in that: it is about what the image shows, and mostly ends at the border, too.
+itself.  A predicted hull does not count in this: it is about what the image shows, and mostly ends at the border, too.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from sq_perception.fitting.rivals import resized
 from sq_perception.geometry.kernels import kernel
 
 THIN = 0.3
-"""A size that the image leaves open is also tried this thin, as a share of the other two."""
+"""Half size, as a share of the other two, at which one that the image leaves open is also tried."""
 EXPECTATION_SIGMA = 0.25
-"""Of a log half size against the network's: its errors on household things, of which one in ten is far off."""
+"""Sigma of a log half size from the network's: its errors on household things, of which one in ten is far off."""
 _LONGER = (1.25, 1.6)
-"""Times the half size at hand."""
+"""Factors of the half size at hand."""
 _ALLOWED = DOUBT / 2
-"""A cost that is larger by this is so with a standard deviation of 7 through noise: no evidence against a length."""
+"""Excess of a cost that is no evidence against a length: through noise its standard deviation is 7."""
 _RAYS = 1000
-"""Of the search for each longer body, which begins near its valley."""
+"""Rays of the search for each longer body, which begins near its valley."""
 
 
 def weighed(solution: Solution) -> Solution:
@@ -74,7 +74,7 @@ def weighed(solution: Solution) -> Solution:
 
 
 def with_open_ends(solution: Solution) -> Solution:
-    """The solution, with longer bodies beside it where the image's border hides how long it is."""
+    """The solution, with longer bodies as alternatives where the image's border hides how long it is."""
     problem, state = solution.problem, solution.state
     ends = list(_hidden_ends(problem.observation, state))
     if not ends:
@@ -96,9 +96,9 @@ def with_open_ends(solution: Solution) -> Solution:
 
 
 def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:
-    """Axis and sign of each end of a body that lies beyond all readings, on a side where these end within the object.
+    """Axis and sign of each end of a body beyond all readings, on a side where readings end within the object.
 
-    There is the border of the image, or a band without readings along it: of a rectified image, of a stereo camera.
+    They end at the image's border, or at a band without readings along it: of a rectified image, of a stereo camera.
     """
     left, top, right, bottom, cut = _borders(observation.depth, observation.mask, observation.free)
     if not cut.any():
@@ -119,7 +119,7 @@ def _borders(
     depth: np.ndarray, mask: np.ndarray, free: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """First reading of each row (h,) and column (w,), the last ones, and on which of these sides (4,) the object has
-    any of them.  Free pixels, indices into the image (h, w), count as readings: some are known to be empty without.
+    any of them.  Free pixels, indices into the image (h, w), count as readings: some are known to be empty without one.
     """
     height, width = depth.shape
     known = np.isfinite(depth)
