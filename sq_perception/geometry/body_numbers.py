@@ -1,4 +1,4 @@
-"""Which numbers are those of a superquadric."""
+"""Checks that numbers are those of a superquadric."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 LENGTHS = {"size": 3, "shape": 2, "translation": 3, "rotation": 4}
 LEAST_CONJUGATE = 1e-3
-"""Of 2 - e, the exponent of the dual norm: 0 would be the maximum of an octahedron, from which this differs by at most
-0.04 % for each norm, and without a division by 0."""
+"""Least 2 - e, the exponent of the dual norm: 0 would be the maximum of an octahedron, from which this differs by at
+most 0.04 % for each norm, and without a division by 0."""
 _LEAST_SQUARE = 1e-18
-"""Of the length of a quaternion."""
+"""Least squared length of a quaternion."""
 
 
 def floating(part: Any) -> np.ndarray:
@@ -24,7 +24,7 @@ def floating(part: Any) -> np.ndarray:
 def one_body(parts: list[Any]) -> np.ndarray | None:
     """Size, shape, translation and rotation, made a unit quaternion, of a single NumPy body: read-only, (12,).
 
-    So few numbers are checked ten times as fast in Python.  None for all else, what is no body included.
+    So few numbers are checked ten times as fast in Python.  None for anything else, numbers of no body included.
     """
     for part in parts:
         if not (type(part) is np.ndarray and part.ndim == 1 and part.dtype == np.float64):

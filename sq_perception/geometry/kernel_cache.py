@@ -65,7 +65,7 @@ def _announce() -> None:
 
 @cache
 def _passed_over(named: str) -> None:
-    """Say once what numba does not."""
+    """Warn once of a NUMBA_CACHE_DIR that cannot be written, as numba does not."""
     _log.warning(
         "NUMBA_CACHE_DIR: %s cannot be written: compiled kernels are kept elsewhere, `sq-perception doctor` says where",
         named,

@@ -34,7 +34,7 @@ Form: TypeAlias = tuple[float, float, float, float, float]
 """a1 a2 a3 e1 e2."""
 
 _PROCESS, _one_at_a_time = os.getpid(), threading.Lock()
-"""Of parallel kernels."""
+"""The process that may run parallel kernels, and the lock that makes their calls wait for each other."""
 _ROOT = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(rf"^ *from ({_ROOT.name}[.\w]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
@@ -47,7 +47,7 @@ def kernel(function: _F) -> _F:
 
 
 def parallel_kernel(function: _F) -> _F:
-    """The same, with ``numba.prange`` over all cores; for callers in Python.
+    """Compile as :func:`kernel`, with ``numba.prange`` over all cores; for callers in Python.
 
     Threads of numba may serve one call at a time, and end the process that calls them after a fork: calls wait for each
     other, and a forked process computes on one thread.
@@ -79,7 +79,7 @@ def _compiled(function: _F, **more: bool) -> _F:
 
 @cache
 def _fingerprint(file: Path) -> str:
-    """A digest of a source file with all those of this package that it imports, and these import.
+    """A digest of a source file and all those of this package that it imports, directly or through others.
 
     numba keeps machine code under the name of a function and checks the file that holds it, but not the files of the
     kernels that were compiled into it: an update of this module alone would leave the old code at work elsewhere.  With
@@ -107,7 +107,7 @@ def _imported(file: Path) -> set[Path]:
 
 
 RAY_TOLERANCE, MAX_NEWTON_STEPS = 1e-9, 60
-"""Where a ray meets a body, as a share of its way through the bounding box, and how near the gauge is to 1 there."""
+"""Tolerance of a ray's entry, as a share of its way through the bounding box, and of the gauge there; most steps."""
 _NEGLIGIBLE_LOG2 = -115.0
 """A power below 2^this adds nothing to 1."""
 _TINIEST, _TINY = 1e-290, 1e-145
@@ -139,7 +139,7 @@ def p_norm(u: float, v: float, e: float) -> tuple[float, float, float, float]:
 
 @inline_kernel
 def gauge(x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
-    """g at a point."""
+    """The gauge g at a point."""
     h, _, _, _ = p_norm(abs(x) / a1, abs(y) / a2, e2)
     g, _, _, _ = p_norm(h, abs(z) / a3, e1)
     return g

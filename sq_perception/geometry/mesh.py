@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import trimesh
 
 MARKER_RESOLUTION = 16
-"""Coarse enough to be serialised at camera rate: about 35 kB per body."""
+"""Resolution of markers: coarse enough to be serialised at camera rate, about 35 kB per body."""
 
 COLOURS = np.array(
     [
@@ -43,7 +43,7 @@ depth pictures, to normal, deuteranopic and protanopic eyes (Machado et al. 2009
 """
 
 HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between the optical frame, y down, and that of viewers of meshes, y up."""
+"""Turn between the optical frame, y down, and that of viewers of meshes, y up."""
 _SAME_POINT_DIGITS = 12
 
 

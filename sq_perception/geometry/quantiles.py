@@ -1,7 +1,7 @@
 """Order statistics of one array: quantiles, a robust standard deviation, and where numbers are densest.
 
-:func:`quantile` and :func:`ranked` give what ``np.quantile`` does.  It spends most of its time on options where there
-are few numbers, and on moving them where there are many.
+:func:`quantile` and :func:`ranked` give what ``np.quantile`` does.  NumPy spends most of its time on options where
+there are few numbers, and on moving them where there are many.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def deviation(sizes: np.ndarray) -> float:
 
 
 def densest(ordered: np.ndarray, width: float) -> slice:
-    """Where most of some ordered numbers (n,) lie within a width of the first one there; the first of such places."""
+    """The slice of ordered numbers (n,) with most of them within ``width`` of its first; the first such slice."""
     if not len(ordered):
         return slice(0)
     counts = np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered))

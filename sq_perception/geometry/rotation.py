@@ -157,7 +157,7 @@ def _components(array: Array) -> Any:
 
 
 def _joined(components: list[Any], *parts: Array) -> Array:
-    """What was computed from the components of some arrays as one array."""
+    """One array of components that were computed from those of ``parts``."""
     if type(components[0]) in (float, int):
         return np.array(components, dtype=np.result_type(*parts))
     return array_namespace(*parts).stack(components, axis=-1)

@@ -31,6 +31,6 @@ DIRECTIONS = _icosphere()
 
 
 def mirrored(axis: int) -> np.ndarray:
-    """Where each direction goes, (42,) indices, when coordinate ``axis`` changes its sign; its own inverse."""
+    """Indices (42,) of where directions go when coordinate ``axis`` changes its sign; its own inverse."""
     image = DIRECTIONS * np.where(np.arange(3) == axis, -1, 1)
     return np.asarray(np.argmax(image @ DIRECTIONS.T, axis=1))

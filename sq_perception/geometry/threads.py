@@ -1,8 +1,8 @@
 """What threads of this process may do: BLAS, torch and kernels on one thread, Python's own in short turns.
 
 The matrices here are small.  Threads of a BLAS spin after products as small as these, on the cores that fits of other
-objects, or other programs, want.  Settings are the process'; they are taken back when the last block that wants them
-ends.
+objects, or other programs, want.  Settings belong to the process; they are taken back when the last block that asks for
+them ends.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from threadpoolctl import ThreadpoolController
 
 _lock = threading.Lock()
 _blocks: list[Any] = []
-"""For each block that wants one thread what undoes the setting: the same for all."""
+"""What undoes the setting, once for each block that asks for one thread: the same for all."""
 TURN = 0.001
-"""Seconds after which a thread of Python lets another one go on.  One comes back from compiled code to wait for the
-interpreter: with Python's 5 ms, two threads recovered five bodies of a VGA frame in 53 ms, where one took 51; with 1 ms
-in 45, and with less as well."""
+"""Seconds after which a thread of Python lets another one go on.  A thread that returns from compiled code waits for
+the interpreter: with Python's 5 ms, two threads recovered five bodies of a VGA frame in 53 ms, where one took 51; with
+1 ms in 45, and with less as well."""
 _turns: list[float] = []
-"""The same for short turns: Python's own setting."""
+"""Python's own setting, once for each block that asks for short turns."""
 
 
 @cache

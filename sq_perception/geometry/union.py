@@ -1,7 +1,7 @@
 """Unions of superquadrics, as flat parameters (k, 12), compiled: the support function of their hull, and motion.
 
-The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  What is drawn by the
-thousand for training needs it some ten times each; :class:`Superquadric` computes the same for one body at a time.
+The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  Things drawn by the
+thousand for training need it some ten times each; :class:`Superquadric` computes the same for one body at a time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ def support_of_union(parts: Superquadric, directions: np.ndarray) -> np.ndarray:
 
 @kernel
 def flat_support(flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """:func:`support_of_union` of flat parameters (k, 12)."""
+    """The support function (J,) of :func:`support_of_union`, for flat parameters (k, 12)."""
     reach = np.full(directions.shape[0], -np.inf)
     for k in range(flat.shape[0]):
         m = _matrix(flat[k, 8:])
