@@ -23,19 +23,19 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
 
 _TOO_WIDE = 0.8
-"""A body that is wider than the opening by so many sigmas of its width is not tried: once in five it would fit."""
+"""Sigmas of a body's width by which it may exceed the opening and is tried still: beyond, it would fit once in five."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
 """Turns of the approach about the closing line, away from the steepest one."""
 _STEEP, _FROM_BELOW = 0.3, -0.1
-"""Sines: a closing line is at least so far off the vertical, and no hand comes more upwards than that."""
+"""Sines of the least angle of a closing line to the vertical, and of how steeply down a hand comes at least."""
 _SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
-"""Along the third axis, shares of the way to where the finger's width is no more wholly on the body."""
+"""Slides along the third axis, as shares of the way to where the finger's width is no longer wholly on the body."""
 _SAME = 1e-3
-"""Metres: slides of less are the one in the middle."""
+"""Slide, metres, below which it counts as the one in the middle."""
 _ABOVE_TABLE = 0.004
-"""Metres."""
+"""Height above the table that a gripper keeps at its deepest, metres."""
 _ENGAGED = 0.012
-"""Metres of finger beyond the near end that a shallow grasp has."""
+"""Length of finger beyond the near end in a shallow grasp, metres."""
 
 
 class Closings(NamedTuple):
@@ -56,19 +56,19 @@ class Approaches(NamedTuple):
     Attributes
     ----------
     owner, reach, sigma
-        As of the closings.
+        Those of the closings.
     frames : (k, 3, 4)
         The TCP's axes as columns, and the body's centre.
     tilting : (k, 3)
         Horizontal, across the closing line: what lies off the centre along it turns the body in the hand.
     near, near_sigma, across : (k,)
-        From the centre to the near end, the sigma of that, and to the end along x.
+        Distance from the centre to the near end, its sigma, and the distance to the end along x.
     opening, shift : (k,)
-        Of the fingers, and of the hand towards the side that is less sure.
+        Opening of the fingers, and shift of the hand towards the side that is less sure.
     deepest : (k,)
         u at which the palm or the table stops the hand, or the centre is reached.
     height : (k,)
-        Of the lowest corner above the table with the TCP in the centre; inf without a table.
+        Height of the lowest corner above the table with the TCP in the centre; inf without a table.
     """
 
     owner: np.ndarray
@@ -94,15 +94,15 @@ class Places(NamedTuple):
     Attributes
     ----------
     of : int (k,)
-        Their approaches.
+        Indices of their approaches.
     ahead : (k,)
         u.
     offset : (k, 3)
-        From the body's centre.
+        Offset from the body's centre.
     ends : (k, 2)
-        Of the closing line, from the offset to the body's surface on either side; NaN where it misses the body.
+        From the offset along the closing line to the body's surface on either side; NaN where it misses the body.
     angle : (k,)
-        The larger one between that line and the normals there; NaN likewise, and where it is too large to hold.
+        The larger angle between that line and the normals there; NaN likewise, and where it is too large to hold.
     """
 
     of: np.ndarray
@@ -146,7 +146,7 @@ def from_every_side(
 
     wanted = CLEARANCE + 2 * np.hypot(side, placement)
     room = np.minimum(gripper.opening - 2 * half, wanted.sum(axis=1))
-    # Of the room each side has its share: the hand is moved towards the side that is less sure.
+    # Each side has its share of the room: the hand is moved towards the side that is less sure.
     shift = 0.5 * np.maximum(room, 0.0) * (wanted[:, 0] - wanted[:, 1]) / wanted.sum(axis=1)
     opening = 2 * half + room
     frames = np.stack([x, y, z, bodies.middle[owner]], axis=2)
@@ -180,7 +180,7 @@ def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: f
     # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
     near, owner = every.near[of], every.owner[of]
     touch = 0.5 * (np.maximum(u - gripper.tip, -near) + np.minimum(u + gripper.tip, near))
-    along = np.ascontiguousarray(every.frames[of, :, 1])  # kernels are compiled for arrays of a kind
+    along = np.ascontiguousarray(every.frames[of, :, 1])  # kernels are compiled for one kind of array
     ends, angle = bodies.chords(owner, _offsets(every.frames, of, v, touch), along, steepest)
     squarely = np.isfinite(angle)  # two in five
     has_any = np.zeros(len(bodies), dtype=bool)

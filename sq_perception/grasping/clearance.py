@@ -21,11 +21,11 @@ import numpy as np
 from sq_perception.geometry.kernels import inline_kernel, kernel, support
 
 FAR, NEAR = 0.05, 0.02
-"""Gaps to bodies and distances to points are cut off there: nothing depends on larger ones."""
+"""Largest gap to a body and distance to a point, metres; larger ones are cut off, as nothing depends on them."""
 _CELL = 0.03
-"""Metres: points are passed over by such cubes."""
+"""Side of the cubes by which points are passed over, metres."""
 _STRAY = 3
-"""Nearest points that a gap is not told by: flying pixels."""
+"""Nearest points that do not count for a gap: flying pixels."""
 
 
 @kernel

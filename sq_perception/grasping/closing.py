@@ -28,11 +28,11 @@ from sq_perception.geometry.kernels import conjugate, gauge_derivatives, kernel,
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
 UNKNOWN = 0.1
-"""Of a half size: its standard deviation where a body comes without one."""
+"""Standard deviation, as a share of a half size, where a body comes without one."""
 _STEP = np.pi / 12
 _NEWTON_STEPS = 4
 _GRAZING = 1e-12
-"""Slopes of the gauge, per metre, that are no way out of a body."""
+"""Slope of the gauge, per metre, up to which a line does not leave a body."""
 _KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
 """Rows of the covariance without the exponents."""
 
@@ -101,7 +101,7 @@ class KnownBodies:
         return self.flat[:, 5:8]
 
     def in_place(self) -> KnownBodies:
-        """The same with centres that are known for sure."""
+        """The bodies with centres that are known for sure."""
         covariance = self.covariance.copy()
         covariance[:, 3:6] = covariance[:, :, 3:6] = 0.0
         return replace(self, covariance=covariance)
@@ -129,9 +129,9 @@ class KnownBodies:
         Returns
         -------
         ends : (k, 2)
-            Along +direction and against it, metres from the offset; NaN where the line misses the body.
+            Distances along +direction and against it from the offset, metres; NaN where the line misses the body.
         angle : (k,)
-            The larger one between direction and the normals at both ends, radians; NaN likewise and above ``steepest``.
+            The larger angle of direction to the normals at both ends, radians; NaN likewise and above ``steepest``.
         """
         ends, cosine = np.empty((2, len(owner))), np.empty((2, len(owner)))
         least = np.cos(steepest)

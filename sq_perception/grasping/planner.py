@@ -19,11 +19,11 @@ Vessels that none of these is sure of are also tried by their rims (:mod:`sq_per
 The opening is the body's width and, on either side, a clearance and twice the sigma of that side; less where the
 gripper opens no wider.  The hand stands farther from the side that is less sure.  A side that was not seen is
 uncertain, so that a body of unknown depth is taken by its known sides.  The hand comes to be where it is sent to but
-for the error of its calibration.  By what real things stray from superquadrics is in the covariance of a fit already.
+for the error of its calibration.  How far real things stray from superquadrics is in the covariance of a fit already.
 Where the image shows that the place of a pad, or of the palm between the fingers, is empty, there is no body: its sides
-and its near end count by the share of that place which is hidden, and how far measured points are tells the rest.
-Margins are taken for independent of each other, but for measured points: they are those of the bodies, so that what
-counts is what they take beyond opening, palm and other bodies.
+and its near end count by the share of that place which is hidden, and the distance of measured points tells the rest.
+Margins are taken as independent of each other, except that of measured points: these are points of the bodies, so that
+only what it takes beyond opening, palm and other bodies counts.
 
 Metres, newtons, kilograms; the pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame
 of the bodies.
@@ -62,23 +62,23 @@ from sq_perception.imaging.camera import Camera
 FRICTION = 0.5
 """Coefficient of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
 _AT_MOST = 2.0
-"""Times the least friction."""
+"""Most friction, in multiples of the least."""
 PER_BODY = 8
 """Grasps a body that are returned at most."""
 PLACEMENT = 0.002
 """Metres, standard deviation along each axis of where the hand comes to be: a careful calibration of camera and arm."""
 _SQUARE = np.deg2rad(8.0)
-"""How sure normals are."""
+"""Standard deviation of normals, radians."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
 _CLEAR = 0.95
-"""Grasps that pass a body with that probability where it is widest need not be looked at more closely."""
+"""Probability of passing a body where it is widest, from which on a grasp need not be looked at more closely."""
 _CHECKED, _CHECKED_CLOSELY = 40, 16
 """Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
 _CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
-"""Grasps looked at of a body whose best one is less probable than that after the first ones."""
+"""Grasps looked at of a body whose best one, after the first ones, is less probable than the second number."""
 _LEAST = 0.05
-"""Grasps less probable than that are not returned."""
+"""Probability below which grasps are not returned."""
 
 
 def grasps(
@@ -253,7 +253,7 @@ def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Sur
 
 
 def _as_grasps(trials: Trials) -> Iterator[Grasp]:
-    """All of them, the most probable first."""
+    """All trials as grasps, the most probable first."""
     total = trials.total
     order = np.argsort(-total, kind="stable")
     turns = quaternions.from_matrix(trials.frames[:, :, :3])

@@ -37,11 +37,11 @@ _BEARINGS = np.arange(24) * np.pi / 12
 _INSETS = np.array([0.012, 0.02, 0.03])
 """Depths of the fingers' ends below the rim, metres."""
 _BEYOND = 0.015
-"""Points so far outside of a body may be its rim."""
+"""Distance outside of a body up to which points may be its rim, metres."""
 _HIGH, _THIN = 0.006, 0.012
-"""The rim is so high, and no thicker."""
+"""Height of the rim, and its largest thickness, metres."""
 _FEWEST, _STRAY = 5, 3
-"""Points of a bearing; of these the highest, up to flying pixels, is the top."""
+"""Fewest points of a bearing, and which of them, from the highest on, is the top: flying pixels may lie above it."""
 _UPRIGHT = 0.9
 """Share of rims that held where all other margins were sure: 31 of 35 that scenes of benchmarks/picking.py from
 seed 20000 on, none of which is reported, ended with.  In place of friction: how steep a wall is, is not looked at."""

@@ -11,17 +11,17 @@ from sq_perception.imaging import perforation
 from sq_perception.imaging.camera import Camera, Lens
 
 _BEHIND = 0.015
-"""A place so many metres behind what a pixel measured was not seen."""
+"""Distance behind what a pixel measured, metres, from which on a place was not seen."""
 _EMPTY = 0.005
-"""A place so many metres before what a pixel measured is empty."""
+"""Distance before what a pixel measured, metres, from which on a place is empty."""
 _NEAREST = 1e-3
-"""Metres before the camera that a place is at least, if the image shows it."""
+"""Least depth of a place that the image shows, metres."""
 _SPACING = 0.005
-"""Metres between the points that are kept."""
+"""Spacing of the points that are kept, metres."""
 _MOST = 6000
-"""Points that are kept."""
+"""Most points that are kept."""
 _ABOVE = 0.008
-"""Metres; lower points are the table's."""
+"""Height below which points are the table's, metres."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,15 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 DENSITY = 500.0
-"""kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
+"""Density of things, kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 CLEARANCE = 0.005
-"""Metres on either side of the body and before the palm."""
+"""Clearance on either side of the body and before the palm, metres."""
 LEAST_ENGAGED = 0.004
-"""Metres of finger that have to be beyond the near end."""
+"""Least length of finger beyond the near end, metres."""
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
-"""Metres to which thinned points tell where the side of a thing is that the image shows a finger to pass: of 247 such
-sides, 3.3 with the 2 mm of the hand (30 scenes of benchmarks/picking.py from seed 30010 on)."""
+"""Standard deviation, metres, to which thinned points tell where a thing's side is that the image shows a finger to
+pass: of 247 such sides, 3.3 mm with the 2 mm of the hand (30 scenes of benchmarks/picking.py from seed 30010 on)."""
 PASSES = 0.001
 """Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
 (60 household things in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
@@ -28,7 +28,7 @@ to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none
 they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
 _GRAVITY, _LIFT = 9.81, 2.0
-"""m/s^2; of the lift beside gravity."""
+"""Accelerations of gravity and of the lift beside it, m/s^2."""
 _PAD_RADIUS = 0.006
 """Mean arm of the friction of a pad of some 18 mm, metres."""
 
@@ -59,7 +59,7 @@ class Trials(NamedTuple):
 
     @property
     def weakest(self) -> np.ndarray:
-        """Which margin takes most from each."""
+        """Index (k,) of the margin that takes most from each trial."""
         return np.asarray(np.argmin(self.logs, axis=1))
 
     def first(self, count: int, least: float = -np.inf) -> Trials:
@@ -70,7 +70,7 @@ class Trials(NamedTuple):
         return self.at(rows[_rank(self.owner[rows]) < count])
 
     def after(self, count: int) -> Trials:
-        """The others, of trials that are in order."""
+        """The trials but the ``count`` first ones of each body, of trials in the order of :meth:`first`."""
         return self.at(np.flatnonzero(_rank(self.owner) >= count))
 
 

@@ -13,9 +13,9 @@ are what is left between ``/``, ``_`` and other marks.  The transport's own part
 ``image_rect``, ``image_rect_raw``, ``depth/rect/image`` and ``depth_registered/image_rect`` are rectified,
 ``image_raw``, ``depth/image`` and ``direct/image`` are not.  A file's name is its folder's and its own.
 
-That depth was registered to a colour image changes nothing in this: it has the geometry of that image, and a
-camera_info that describes that image.  ``aligned_depth_to_color/image_raw`` and ``depth_to_rgb/image_raw`` are as
-distorted as their raw colour image, whose D they come with; ``depth_registered/image_rect`` lies on the rectified one.
+Depth registered to a colour image is no exception: it has the geometry of that image, and a camera_info that describes
+it.  ``aligned_depth_to_color/image_raw`` and ``depth_to_rgb/image_raw`` are as distorted as their raw colour image,
+whose D they come with; ``depth_registered/image_rect`` lies on the rectified one.
 
 A rectified image has the intrinsics of P, or of K where P is not set; a raw one those of K, whatever P is, and is
 rectified here (:mod:`sq_perception.imaging.rectification`).
@@ -57,7 +57,7 @@ class Calibration:
     camera : Camera
         The pinhole camera of the rectified images.
     rectification : Rectification or None
-        Between the two; None where an image is rectified as it comes.
+        From raw images to those of ``camera``; None where they are sent rectified.
     note : str
         What auto has decided about distortion coefficients that are there, and how to change that; empty if it had
         nothing to decide.
@@ -164,7 +164,7 @@ def intrinsics(camera: Camera) -> Intrinsics:
 
 
 def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion | None:
-    """None for one that moves nothing; a fisheye lens always moves."""
+    """The distortion; None where it moves nothing.  A fisheye lens always moves something."""
     if model != FISHEYE and not is_distorted(coefficients):
         return None
     try:

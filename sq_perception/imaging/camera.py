@@ -25,9 +25,9 @@ import numpy as np
 
 Projection = Literal["pinhole", "orthographic"]
 LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
-"""Metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
+"""Median depths, metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
 LEAST_DEPTH, GREATEST_DEPTH = 1e-4, 1e5
-"""Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
+"""Depths, metres; no sensor measures beyond, and squares and products of numbers beyond are no numbers."""
 
 
 class Lens(NamedTuple):
@@ -72,7 +72,8 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> Camera:
-        """A pinhole camera from a 3 x 3 matrix K, refused with skew, as no depth camera has any, or transposed."""
+        """A pinhole camera from a 3 x 3 matrix K; one with skew, as no depth camera has any, or transposed is
+        refused."""
         k = np.asarray(matrix, dtype=float)
         if k.shape != (3, 3):
             raise ValueError(f"camera matrix: expected 3 x 3, got {k.shape}")

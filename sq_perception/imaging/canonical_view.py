@@ -49,12 +49,13 @@ NEAREST = 0.5 * (1 + 1 / MARGIN)
 OUTLIERS_PER_END = 1 / 500
 """Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
 _SURROUNDINGS = 1.2
-"""More than MARGIN: under perspective the view's edges are not where those of the silhouette's box are."""
+"""Side of the part of the image that is looked at, in sides of the silhouette's box; more than MARGIN, as under
+perspective the view's edges are not where those of the box are."""
 _NEARER = 0.04
-"""What stands nearer than the object by this share of the view's side hides what is behind it."""
+"""Share of the view's side by which something nearer than the object hides what is behind it."""
 _FROM_ABOVE, _LEVEL = 0.2, float(np.cos(np.deg2rad(15.0)))
-"""A support whose normal has less across the optical axis, 12 degrees, does not tell the roll; and the cosine of a roll
-that is none: networks have seen as much."""
+"""Least part of a support's normal across the optical axis that tells the roll, 12 degrees; and cosine of a roll that
+counts as none: networks have seen as much."""
 _ROUNDS = 3
 """Readings of z that settle where a pixel of the view looks."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -91,7 +92,7 @@ class CanonicalView:
         """Background pixels (n, n) at which the object may go on unseen.
 
         Something nearer stands there, or nothing was measured within the object's convex hull, or nothing was measured
-        at all; see :func:`from_mask`.  All False where it was not asked for it.
+        at all; see :func:`from_mask`.  All False where this was not asked for.
         """
         return ~(self.beside <= _NEARER)
 
@@ -109,8 +110,8 @@ class CanonicalView:
             HIDDEN (1 + root(s))       something nearer
             FLUSH (1 - root(-s))       flush to far behind: 0
 
-        A thing that ends at what touches it mostly ends there, what stands far before it says nothing of where; flush
-        readings beside it are its own where a mask is too small.  Roots, as steps that matter are of hundredths.
+        A thing mostly ends where something touches it, while what stands far before it says nothing of where it ends;
+        flush readings beside it are its own where a mask is too small.  Roots, as steps that matter are of hundredths.
         """
         ahead, behind = np.sqrt(np.clip(self.beside, 0, 1)), np.sqrt(np.clip(-self.beside, 0, 1))
         step = np.where(self.hidden, HIDDEN * (1 + ahead), FLUSH * (1 - behind)).astype(np.float32)

@@ -43,7 +43,7 @@ _WIDEST = math.pi / 2 - 1e-3
 _SAMPLES = 4096
 _STEPS = 20
 _EXACT = 1e-13
-"""Of the images' place: a ten-thousandth of a millionth of a pixel."""
+"""Tolerance of the place of an image: a ten-thousandth of a millionth of a pixel."""
 _NEAR_AXIS = 1e-6
 """s below which the fisheye's q is its series."""
 

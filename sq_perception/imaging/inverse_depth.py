@@ -38,8 +38,8 @@ class InverseDepth:
     w : float32 (height, width)
         1 / z, 0 where nothing is seen.
     slope_u, slope_v : float32 (height, width)
-        dw/du and dw/dv of the surface in the pixel: of the differences to either side the smaller one, which is that
-        within the surface where the other one crosses a jump.
+        dw/du and dw/dv of the surface in the pixel: the smaller of the differences to either side, which lies within
+        the surface where the other one crosses a jump.
     """
 
     camera: Camera
@@ -142,7 +142,7 @@ def _apart(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
 
 
 def _smaller_difference(w: np.ndarray, axis: int) -> np.ndarray:
-    """Of the differences of each pixel to both its neighbours the one nearer to 0; at the border the only one."""
+    """The one nearer to 0 of the differences of each pixel to its two neighbours; at the border the only one."""
     if w.shape[axis] == 1:
         return np.zeros_like(w)
     step = np.diff(w, axis=axis)

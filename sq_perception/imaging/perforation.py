@@ -26,7 +26,7 @@ def filled(
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """A perforated image with its gaps closed, labels that go with the readings, and the gaps, bool (height, width).
 
-    Any other image as it is, without gaps: None.
+    Any other image is returned as it is, with None for the gaps.
     """
     measured = np.isfinite(depth)
     if measured.all():

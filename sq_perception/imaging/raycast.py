@@ -15,7 +15,7 @@ from sq_perception.imaging.camera import Camera, Lens
 _CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 """Corners of a box: which of its lower and upper x, y and z each is at."""
 _NEAR = 1e-6
-"""Metres before a pinhole camera, nearer than which a corner says nothing of where a thing is seen."""
+"""Depth before a pinhole camera, metres, below which a corner says nothing of where a thing is seen."""
 
 
 def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

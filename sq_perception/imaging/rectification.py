@@ -41,7 +41,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 
 LARGEST_SIDE = 2**15 - 2
-"""Pixels; what OpenCV can look up."""
+"""Largest side of an image that OpenCV can look up, pixels."""
 _KEPT = 16
 """Calibrations whose tables are kept."""
 _GROWTH = 2.0
@@ -51,7 +51,7 @@ _BORDER = 64
 _STEEPEST = 10.0
 """Tangent of the incidence beyond which a step between neighbours is a jump."""
 _CLOSE = 0.01
-"""Pixels between two places that are as good as one."""
+"""Distance of two places that are as good as one, pixels."""
 _SQUARE = np.ones((2, 2), np.uint8)
 _OUTSIDE = -9.0
 """A column and row that no image has."""
@@ -95,20 +95,20 @@ class Rectification:
 
     @cached_property
     def there(self) -> Lookup:
-        """Images of :attr:`camera` from raw ones."""
+        """Lookup of images of :attr:`camera` in raw ones."""
         rays = _rays(self.camera, *_grid(self.camera))
         return Lookup.of(_pixels(self.raw, self.distortion.forward(rays)), self.raw)
 
     @cached_property
     def back(self) -> Lookup:
-        """Raw images from those of :attr:`camera`."""
+        """Lookup of raw images in those of :attr:`camera`."""
         images = _rays(self.raw, *_grid(self.raw))
         return Lookup.of(_pixels(self.camera, self.distortion.inverse(images)), self.camera)
 
 
 @lru_cache(maxsize=_KEPT)
 def rectification(raw: Camera, distortion: Distortion) -> Rectification:
-    """The one of this calibration: equal calibrations share one, and its tables.
+    """The rectification of this calibration: equal calibrations share one, and its tables.
 
     Raises
     ------
@@ -146,7 +146,7 @@ class Lookup:
 
     @classmethod
     def of(cls, places: np.ndarray, source: Camera) -> Lookup:
-        """From places (height, width, 2) in the image of ``source``, NaN where it sees nothing."""
+        """The lookup of places (height, width, 2) in the image of ``source``, NaN where it sees nothing."""
         places = np.nan_to_num(places, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
         places = np.clip(places, _OUTSIDE, LARGEST_SIDE + 1).astype(np.float32)
         u, v = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
@@ -156,9 +156,9 @@ class Lookup:
         return cls(source, u, v, left, top, (off <= _CLOSE).view(np.uint8), min(step, 0.5))
 
     def depth(self, image: np.ndarray) -> np.ndarray:
-        """The depth image, float32 in metres, of one of the source: positive, NaN or +inf where there is nothing.
+        """The depth image, float32 in metres, from one of the source: positive, NaN or +inf where there is nothing.
 
-        NaN where there is none, also where the source does not see.
+        The result is NaN where there is no depth, also where the source does not see.
         """
         image = np.ascontiguousarray(image, dtype=np.float32)
         nearest = self._nearest(image, np.nan)
@@ -168,7 +168,7 @@ class Lookup:
             inverse = cv2.patchNaNs(1 / bridged, 0)
             closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, depth_steps.CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
-            # Of each pixel and its neighbours to the right, below, and across.
+            # Extremes over each pixel and its neighbours to the right, below, and across.
             least, most = (find(inverse, _SQUARE, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
             smooth: np.ndarray = (least > np.float32(1 - self.step) * most).view(np.uint8)
             smooth[-1], smooth[:, -1] = 0, 0
@@ -179,7 +179,7 @@ class Lookup:
         return cv2.copyTo(nearest, self.close, cv2.copyTo(between, smooth, result))
 
     def labels(self, image: np.ndarray) -> np.ndarray:
-        """The label image, int32, of one of the source; 0 where there are none, also where the source does not see."""
+        """The label image, int32, from one of the source; 0 where there is none, also where the source does not see."""
         # OpenCV looks up no int32; bits are moved as they are.
         return self._nearest(np.ascontiguousarray(image, dtype=np.int32).view(np.float32), 0.0).view(np.int32)
 

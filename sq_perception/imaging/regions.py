@@ -74,7 +74,7 @@ def box(mask: np.ndarray) -> tuple[int, int, int, int]:
 def fills(mask_box: tuple[int, int, int, int], measured: np.ndarray) -> bool:
     """Whether the box of a mask, as by :func:`box`, runs out of all readings, bool (height, width), on opposite sides.
 
-    They need not reach the border of the image, as those of a rectified one and of a stereo camera do not.
+    Readings need not reach the border of the image, as those of a rectified one and of a stereo camera do not.
     """
     (left, top, wide, high), (rows, columns) = mask_box, measured.shape
     across = left <= _BAND * columns and left + wide >= (1 - _BAND) * columns
@@ -88,7 +88,7 @@ def fills(mask_box: tuple[int, int, int, int], measured: np.ndarray) -> bool:
 
 @kernel
 def renumbered(labels: np.ndarray, number: np.ndarray) -> np.ndarray:
-    """Labels int32 (height, width) with other ones in their place: number (count + 1,) of each."""
+    """Labels int32 (height, width) with other ones in their place: ``number`` (count + 1,) gives that of each."""
     found = np.empty(labels.shape, np.int32)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -139,11 +139,11 @@ def borders(
     Returns
     -------
     met : (count + 1, count + 1)
-        All of these contacts.
+        Number of all of these contacts.
     beside
-        Those at which the two are less than ``near`` metres apart along the line of sight; none of label 0.
+        Number of those at which the two are less than ``near`` metres apart along the line of sight; 0 for label 0.
     behind
-        Of a (row) and b (column), those at which a is farther than b by a depth step, and by less than ``far`` metres.
+        Number of those at which a (row) is farther than b (column) by a depth step, and by less than ``far`` metres.
     """
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near, far)

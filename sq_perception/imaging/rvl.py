@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 MOST_PIXELS = 2**23
-"""Above any depth camera's; unpacking takes some 100 bytes of memory for each."""
+"""Most pixels of an image: above any depth camera's; unpacking takes some 100 bytes of memory for each."""
 
 _MOST_BYTES = 4
 """Bytes for each pixel: 17 bits of a difference are 6 nibbles, and a run of one pixel has 2 more."""

@@ -1,4 +1,4 @@
-"""What shows which readings of a segment are of its object: the segment in its surroundings.
+"""The view that shows which readings of a segment are of its object: the segment in its surroundings.
 
 A window of the image about the segment, square to the camera, larger than its longer side L by L / 2 + 8 pixels, in
 ``PIXELS`` x ``PIXELS`` cells; of pixels that are not square, lengths count those of the same area that are.  A cell
@@ -39,12 +39,12 @@ _POINTS = 3
 """Points of a cell along each axis.  A network trained on the same views, shown one point, leaves as many strays in
 others; of 29 recorded things its own masks give 81.9, not 82.4 % IoU."""
 _USUAL_SIDE = 0.2
-"""Metres; that the channel of the scale is 0 for it."""
+"""The s, metres, for which the channel of the scale is 0."""
 _LARGEST = 0.3
-"""Metres of s that the network is told at most: what is larger is known by its shape.  An earlier network that was told
+"""Largest s, metres, that the network is told: what is larger is known by its shape.  An earlier network that was told
 all sizes missed 45 %, not 31 %, of 226 household things of three times their size before a simulated D435."""
 _WIDER, _MORE = 1.5, 8
-"""The window's side in that of the segment, and pixels beyond."""
+"""Side of the window in sides of the segment, and pixels added to it."""
 _HEIGHTS = (-0.3, 1.5)
 
 

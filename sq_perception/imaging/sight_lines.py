@@ -30,8 +30,8 @@ from sq_perception.geometry.superquadric import Superquadric, nested_norm, neste
 
 _HALVINGS = {torch.float64: 40}
 _FEWEST_HALVINGS = 9
-"""Of the body's extent along z.  Training is in single precision and needs no more than where to put its cells; double
-precision is asked for by checks of gradients."""
+"""Fewest halvings of the body's extent along z.  Training is in single precision and needs no more than where to put
+its cells; double precision is asked for by checks of gradients."""
 _LAYER = 6.0
 """The layer ends where s (g^2 - 1) or the optical depth has this value: V, or what is still seen, is below 1/400."""
 

@@ -19,13 +19,13 @@ from sq_perception.geometry.elementary import exp2
 from sq_perception.geometry.kernels import box_interval, gauge, kernel
 
 THESIS_SHARPNESS = 117.3
-"""s."""
+"""Sharpness s of the thesis' renderer."""
 THESIS_TAU = 4.82
 _NEGLIGIBLE = 30.0
 _PER_E = 1 / math.log(2)
 """The logarithm of e to base 2."""
 _AT_ONCE = 16
-"""Voxels, for vector code: some 8 lie where a surface is soft, and 7 of a solid let nothing pass."""
+"""Voxels walked at once, for vector code: some 8 lie where a surface is soft, and 7 of a solid let nothing pass."""
 
 
 @kernel
