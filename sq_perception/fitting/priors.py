@@ -8,7 +8,7 @@ proportion  log a_k minus the mean of the three, over sigma: what the image leav
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
 roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
 hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions against a predicted one b, whitened by
-            W^T W = S^-1.
+            W^T W, the inverse of its covariance (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).
 volume      a linear price on log(a1 a2 a3), which prefers the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are

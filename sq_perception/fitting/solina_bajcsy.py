@@ -62,8 +62,8 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
     Returns
     -------
     Fit
-        Its covariance is NaN: the residual is no distance.  FAILED, with a box around the points, for fewer than 12
-        points or points on a line, and where the result misses the points.
+        Its covariance is NaN: the residual is no distance.  FAILED, with an ellipsoid about the points, for fewer than
+        12 points or points on a line, and where the result misses the points.
 
     Raises
     ------

@@ -11,12 +11,14 @@ There are two courses, :mod:`sq_perception.fitting.exact` and :mod:`sq_perceptio
 is given, it decides: exact for 0, tolerant otherwise.  If none is given, what is known of the object decides:
 
 thing       It stands on a plane, or its hull is predicted: tolerant, unless a cheap exact search finds a body that
-            leaves no more than the noise: before, where readings are fine, else after, from the tolerant course's body.
+            leaves no more than the noise: before, where readings are fine or no plane is known, else after, from the
+            tolerant course's body.  That one stays as another body that the image allows.
 may stray   Neither, but a pinhole camera saw it, and noise may hide how far it strays from a superquadric: exact; a
             body that leaves more than the noise is passed on to the tolerant course.
 else        Such as the bodies of the thesis: exact.
 
-Objects of the first two kinds get the standard deviations of things, whichever course found their bodies.
+Objects of the first two kinds get the standard deviations of things, whichever course found their bodies; but for
+those that an orthographic camera shows and the exact course explains: renderings, without noise.
 
 Frames and units: optical frame, metres, radians.
 """
@@ -191,7 +193,8 @@ def _undecided(task: _Task) -> Solution | None:
         if exactly is not None and not (task.may_stray or (task.camera.is_pinhole and task.is_thing())):
             return exactly
         if (thing := _as_thing(exactly)) is not None:
-            return thing
+            strayed = _solved(task, task.of_things) if task.is_thing() else None
+            return thing if strayed is None else _or_else(thing, strayed.state)
     if not task.is_thing():
         solution = _solved(task, options)
         if solution is not None and task.may_stray:
@@ -235,7 +238,7 @@ def _as_thing(exactly: Solution | None) -> Solution | None:
 def _strayed(task: _Task, exactly: Solution) -> Solution:
     """The tolerant solution for an object of which the exact course left more than the noise."""
     problem = exactly.problem
-    if exactly.spread_factor > 1 or problem.late:  # the tolerant course was reached already, or time is up
+    if problem.independent is not None or problem.late:  # the tolerant course was reached already, or time is up
         return replace(exactly, spread_factor=tolerant.SPREAD)
     options = task.of_things
     strayed = replace(Problem.of(task.observed(options), options, 0.0), deadline=problem.deadline)

@@ -6,7 +6,7 @@ One maximum a posteriori fit.  The cost, minus twice the log of the posterior, i
     free    w rho(r)        pixels beside the object that saw farther keep the body out
     plane, rest             the body does not reach below its support, and mostly lies on a face
     hull                    |W (h - b)|^2: support function h against the predicted b; W depends on the misfit m
-    volume, proportion      weak, and only where nothing is predicted (:mod:`sq_perception.fitting.unseen` then too)
+    volume, proportion      weak, and only where nothing is predicted
 
 See :mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors` and
 :mod:`sq_perception.fitting.hull_prior`.  Where the model errs, neighbouring pixels err alike: the object counts as few
