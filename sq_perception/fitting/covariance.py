@@ -122,19 +122,22 @@ def _beside(state: State, terms: Terms) -> np.ndarray:
 
 
 class Alternative(NamedTuple):
-    """Another body that the image allows, and its weight against all others."""
+    """Another body that the image allows, its weight against all others, and its own covariance (11, 11) if that is
+    more than the result's."""
 
     state: State
     weight: float
+    covariance: np.ndarray | None = None
 
 
 def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
     """Second moments (11, 11) of the alternatives about a body: what several valleys of the cost add to its covariance.
 
-    Sizes are compared along the axes of the body, exponents between bodies with the same z axis.
+    Sizes are compared along the axes of the body, exponents between bodies with the same z axis.  What an alternative
+    is unsure of itself joins for sizes and places.
     """
     moments = np.zeros((STEP_LENGTH, STEP_LENGTH))
-    for other, weight in alternatives:
+    for other, weight, own in alternatives:
         partner = np.abs(state.rotation.T @ other.rotation).argmax(axis=1)
         difference = np.zeros(STEP_LENGTH)
         difference[0:3] = other.parameters[partner] - state.parameters[0:3]
@@ -142,6 +145,9 @@ def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
             difference[3:5] = other.parameters[3:5] - state.parameters[3:5]
         difference[5:8] = other.parameters[5:8] - state.parameters[5:8]
         moments += weight * np.outer(difference, difference)
+        if own is not None:
+            moments[0:3, 0:3] += weight * np.diag(np.diag(own)[partner])
+            moments[5:8, 5:8] += weight * own[5:8, 5:8]
     return moments
 
 

@@ -9,8 +9,13 @@ Statistics 6(2), 1978), and as more things are round than of any one oval shape,
 
 W the total weight of the object's rays, the number of independent residuals that the cost stands for.  D is twice the
 negative log likelihood with variance max(1, c / W): where no superquadric explains a bottle with its neck, the rest is
-no reason to prefer the body that happens to leave less.  Both readings stay with the weights that follow,
-exp(-difference / 2), and what they disagree about widens the covariance.
+no reason to prefer the body that happens to leave less.
+
+Both bodies stay, with weights exp(-difference / 2), and what they disagree about widens the covariance.  But where the
+round one is chosen the weight of the free one leaves 3 log W out: that is the price of parameters that the image
+determines, and a depth that it leaves open is as broad after the image as before.  How open it is, the covariance of
+the free one, joins as well.  Of 339 things of benchmarks/household_things (scenes from 87000 on, plane given) 17 % had
+a half size that erred by more than three deviations with the price and without that covariance, now 9 %.
 
 Metres, optical frame; costs are those of :mod:`sq_perception.fitting.residuals`.
 """
@@ -59,10 +64,12 @@ def weighed(solution: Solution) -> Solution:
     settled = by_cost(round_.settle(state, few) for state in promising)
     best = round_.refined_best(settled, rays)
     better = gain(free.cost, best.cost, rays.weight)
-    weight = math.exp(-0.5 * abs(better))
-    other = Alternative(free if better > 0 else best, weight / (1 + weight))
+    is_round = better > 0
+    odds = math.exp(0.5 * (price(rays.weight) - better if is_round else better))
+    share = odds / (1 + odds)
+    other = Alternative(free, share, solution.covariance) if is_round else Alternative(best, share)
     solution = replace(solution, alternatives=(*solution.alternatives, other))
-    if better <= 0:
+    if not is_round:
         return solution
     notes = (*solution.notes, "taken for a body of revolution")
     return replace(solution, problem=round_, state=best, notes=notes)
@@ -70,8 +77,13 @@ def weighed(solution: Solution) -> Solution:
 
 def gain(free_cost: float, round_cost: float, weight: float) -> float:
     """How much better a body of revolution describes rays of a total weight than a free body; see the module."""
-    simpler = SPARED * math.log(max(weight, 1.0)) + 2 * math.log(ODDS)
+    simpler = price(weight) + 2 * math.log(ODDS)
     return _deviance(free_cost, weight) - _deviance(round_cost, weight) + simpler
+
+
+def price(weight: float) -> float:
+    """What the criterion asks of a free body for its further parameters, on rays of a total weight."""
+    return SPARED * math.log(max(weight, 1.0))
 
 
 def _deviance(cost: float, weight: float) -> float:

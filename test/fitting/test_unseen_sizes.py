@@ -9,7 +9,8 @@ import pytest
 from table_scenes import Table
 
 from sq_perception.fitting import revolution, surface_fit
-from sq_perception.fitting.fit import Fit
+from sq_perception.fitting.covariance import Alternative, spread
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.quality import seen_extents
 from sq_perception.fitting.surface_fit import FitOptions
@@ -80,6 +81,33 @@ def test_the_simpler_family_wins_ties_and_loses_against_evidence() -> None:
     # The deviance has neither a step nor a kink where the variance begins to be estimated.
     below, above = revolution.gain(weight - 1e-6, 10.0, weight), revolution.gain(weight + 1e-6, 10.0, weight)
     assert above - below == pytest.approx(2e-6, rel=1e-3)
+
+
+def test_how_open_a_free_body_is_counts_by_its_share_and_along_the_axes_it_shares() -> None:
+    """Where a round body is chosen, the depth that the image leaves open stays open: the law of total variance."""
+    round_ = State.of(Superquadric([0.04, 0.04, 0.07], [0.1, 1.0], [0.0, 0.0, 0.6], [0.0, 0.0, 0.0, 1.0]))
+    about_x = quaternions.from_rotation_vector(np.array([np.pi / 2, 0.0, 0.0]))  # its z axis is -y, its y axis z
+    free = State.of(Superquadric([0.04, 0.07, 0.02], [0.1, 1.0], [0.0, 0.01, 0.6], about_x))
+    open_depth = np.diag([0.001, 0.002, 0.03, 0, 0, 0.004, 0.005, 0.006, 0, 0, 0]) ** 2
+    moments = spread(round_, [Alternative(free, 0.25, open_depth)])
+    expected = 0.25 * np.array([0.001**2, 0.03**2 + 0.02**2, 0.002**2])
+    np.testing.assert_allclose(np.diag(moments)[:3], expected, rtol=1e-9)
+    np.testing.assert_allclose(np.diag(moments)[5:8], 0.25 * np.array([0.004**2, 0.005**2 + 0.01**2, 0.006**2]))
+    without = spread(round_, [Alternative(free, 0.25)])
+    np.testing.assert_allclose(np.diag(without)[:3], 0.25 * np.array([0, 0.02**2, 0]), atol=1e-18)
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+def test_a_depth_that_only_roundness_tells_is_open_unless_the_body_explains_what_was_seen(seed: int) -> None:
+    """A can's mantle tells its depth; what is left of a bottle beside its body leaves it to the odds of roundness."""
+    foot = standing([0.04, 0.04, 0.06], [0.1, 1.0])
+    neck = Superquadric([0.015, 0.015, 0.11], [0.1, 1.0], foot.translation + 0.05 * NORMAL, foot.rotation)
+    bottle = fitted(Superquadric.stack([foot, neck]), seed)
+    assert "revolution" in bottle.message
+    assert bottle.status is Status.WEAK
+    can = fitted(standing([0.035, 0.035, 0.06], [0.1, 1.0]), seed)
+    assert "revolution" in can.message
+    assert can.status is Status.CONVERGED
 
 
 def test_round_starts_from_a_body_keep_its_seen_face() -> None:
