@@ -165,14 +165,15 @@ class TrackingSession:
         back = quaternions.conjugate(rotation)
         matrix = quaternions.to_matrix(back)
         by_index = {track.observation: track for track in tracks if track.observation is not None}
+        bodies = [by_index[index].superquadric for index in range(len(observed))]
+        if not is_world:
+            bodies = [body.transformed(back, -matrix @ position) for body in bodies]
+        outgrown = _outgrown(bodies, observed)
         found = []
-        for index, observation in enumerate(observed):
+        for index, (body, observation) in enumerate(zip(bodies, observed, strict=True)):
             track = by_index[index]
-            body, covariance = track.superquadric, track.covariance
-            if not is_world:
-                body = body.transformed(back, -matrix @ position)
-                covariance = state.turned(covariance, matrix)
-            is_fused = is_pose_known and track.follows and not _is_outgrown(body, observation)
+            covariance = track.covariance if is_world else state.turned(track.covariance, matrix)
+            is_fused = is_pose_known and track.follows and not outgrown[index]
             if not is_fused:
                 body, covariance = _in_form_of(body, covariance, observation)
             elif not np.isfinite(observation.covariance).all():
@@ -188,10 +189,14 @@ class TrackingSession:
         return self._tracker
 
 
-def _is_outgrown(body: Superquadric, observation: Observed) -> bool:
-    """Whether the measured points of an observation span more, along its axes, than a body in its frame is wide."""
-    shown = observation.superquadric
-    return bool((shown.size * observation.seen > _SPANNED * body.support(shown.rotation_matrix.T)).any())
+def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.ndarray:
+    """Which observations (n,) have points that span more, along their axes, than their track's body in this frame."""
+    if not bodies:
+        return np.zeros(0, bool)
+    shown = Superquadric.stack([each.superquadric for each in observed])
+    spanned = shown.size * np.stack([each.seen for each in observed])
+    wide = Superquadric.stack(bodies).support(np.swapaxes(shown.rotation_matrix, -1, -2))
+    return np.asarray((spanned > _SPANNED * wide).any(axis=-1))
 
 
 def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
