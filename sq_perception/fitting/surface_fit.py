@@ -64,10 +64,10 @@ _NOISE_ALONE = 1.06
 noise left less.  Things that left more got worse bodies from the exact course; under a time-of-flight camera, which
 mixes depths at edges, nearly all do."""
 _AS_A_THING = 0.5
-"""Weight of the tolerant course's body as an alternative to an exact one: noise hides how far a thing that a
-superquadric explains strays from one.  Chosen: on 217 things of benchmarks/household_things (60 scenes from seed 54200
-on) under 10 mm of noise, 11 % of the half sizes of converged bodies erred by more than three standard deviations, with
-this weight 3 %."""
+"""Weight of the tolerant course's body as an alternative to an exact one: a thing that a superquadric explains may
+stray from one where nothing was seen, or by less than the noise.  Chosen: on 217 things of benchmarks/household_things
+(60 scenes from seed 54200 on) under 10 mm of noise, 11 % of the half sizes of converged bodies erred by more than three
+standard deviations, with this weight 3 %."""
 
 
 def fit(

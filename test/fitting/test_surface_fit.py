@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +14,7 @@ import pytest
 
 from sq_perception.fitting import covariance, quality, surface_fit
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
+from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import metrics
 from sq_perception.geometry import rotation as quaternions
@@ -192,6 +195,35 @@ def resting_body(rng: np.random.Generator) -> tuple[Superquadric, np.ndarray]:
     rotation = quaternions.multiply(turn, quaternions.from_matrix(axes))
     body = Superquadric(size, np.array([0.2, 0.3]), foot + normal * size[2], rotation)
     return body, np.append(normal, -normal @ foot)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 6])
+def test_a_thing_that_is_exactly_a_superquadric_may_still_be_another_body(seed: int) -> None:
+    """Readings of fine noise may show a part of it that is one: the tolerant course's body counts as well."""
+    truth, plane = resting_body(np.random.default_rng(seed))
+    body, _ = raycast.render(truth, CAMERA)
+    mask = body < scenes.plane_depth(plane, CAMERA)
+    depth = np.where(mask, body, scenes.plane_depth(plane, CAMERA))
+    depth = (depth + np.random.default_rng(seed).normal(0, 1e-4, depth.shape)).astype(np.float32)
+    thing = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane))
+    known = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane, model_error=0.0))
+    assert (thing.status, known.status) == (Status.CONVERGED, Status.CONVERGED)
+    np.testing.assert_allclose(thing.superquadric.size, known.superquadric.size, rtol=1e-3)
+    # Twice and a half are the deviations of things whose residuals err alike.
+    assert (thing.sigma_size / known.sigma_size).max() > 3
+
+
+def test_what_rounded_readings_leave_open_is_no_solution_of_the_tolerant_course() -> None:
+    """Both widen the covariance by a factor; an object that strays is still to be fitted as a thing."""
+    depth, mask = pinhole_image(pinhole_body(np.random.default_rng(3)))
+    crop = Crop.around(depth, mask, CAMERA, None)
+    assert crop is not None
+    task = surface_fit._Task(depth, mask, CAMERA, crop, FitOptions(), [], None, time.perf_counter())
+    exactly = surface_fit._solved(task, task.options)
+    assert exactly is not None
+    assert exactly.problem.independent is None
+    strayed = surface_fit._strayed(task, replace(exactly, spread_factor=2.25))
+    assert strayed.problem.independent is not None
 
 
 @pytest.mark.parametrize("seed", range(6))
