@@ -23,14 +23,12 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import deviation, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera, Lens
+from sq_perception.segmentation import coarse_grid
 from sq_perception.segmentation.options import SegmentationOptions, largest_edge
 from sq_perception.segmentation.support_plane import (
     LEAST_GROWTH,
     TOLERANCE,
     Plane,
-    coarse,
-    connected_parts,
-    in_pixels,
     noise_growth,
 )
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
@@ -115,14 +113,14 @@ def furniture(seen: Seen, valid: np.ndarray) -> np.ndarray:
     """Valid pixels, bool (height, width), of surfaces in one of the walls that are larger than a thing."""
     if not seen.walls:
         return np.zeros(valid.shape, bool)
-    k, rows, columns, points = coarse(seen.known, valid, seen.camera)
+    k, rows, columns, points = coarse_grid.samples(seen.known, valid, seen.camera)
     large = np.zeros(valid[::k, ::k].shape, np.uint8)
     for wall in seen.walls:
-        parts = connected_parts(rows, columns, _lie_on(wall, points), large.shape)
+        parts = coarse_grid.connected_parts(rows, columns, _lie_on(wall, points), large.shape)
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
             if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > seen.options.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
-    return in_pixels(large, k, valid.shape)
+    return coarse_grid.in_pixels(large, k, valid.shape)
 
 
 def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
@@ -139,7 +137,7 @@ def _of_no_segments(seen: Seen, labels: np.ndarray) -> list[Plane]:
     """
     if not seen.walls:
         return []
-    k, rows, columns, points = coarse(seen.depth, seen.depth > 0, seen.camera)
+    k, rows, columns, points = coarse_grid.samples(seen.depth, seen.depth > 0, seen.camera)
     in_segment = labels[::k, ::k][rows, columns] > 0
     found = []
     for wall in seen.walls:

@@ -29,6 +29,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import coarse_grid
 
 TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
@@ -54,8 +55,6 @@ _PLANES = 3
 """A table, the floor below it and a wall behind it."""
 _APART = 2
 """Pixels next to a body that are none of its surroundings, as they may show either."""
-_COARSE_PIXELS = 120
-"""Samples along the shorter side of the image that surfaces are searched on."""
 _ISLAND_SHARE = 0.25
 """Share of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of
 it.  Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
@@ -343,7 +342,7 @@ def across(normal: np.ndarray) -> np.ndarray:
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:
     """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
-    k = coarse_stride(depth.shape)
+    k = coarse_grid.stride(depth.shape)
     coarse, kept = depth[::k, ::k], valid[::k, ::k]
     jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
     labels = depth_steps.components(kept & ~jumps)
@@ -357,40 +356,12 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     return surfaces
 
 
-def coarse_stride(shape: tuple[int, ...]) -> int:
-    """Pixels from a sample of a coarse image to the next."""
-    return max(1, min(shape) // _COARSE_PIXELS)
-
-
-def coarse(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-    """Every k-th pixel of an image that is valid: k, rows and columns counted by it, and points (n, 3)."""
-    k = coarse_stride(depth.shape)
-    rows, columns = np.nonzero(valid[::k, ::k])
-    return k, rows, columns, camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
-
-
-def connected_parts(rows: np.ndarray, columns: np.ndarray, on: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The number, from 1, of the connected part that each sample (n,) of a coarse image of this shape belongs to.
-
-    Parts are those of the samples that are set in ``on``, bool (n,); the others have 0.
-    """
-    mask = np.zeros(shape, bool)
-    mask[rows[on], columns[on]] = True
-    return np.asarray(depth_steps.components(mask)[rows, columns])
-
-
-def in_pixels(mask: np.ndarray, k: int, shape: tuple[int, ...]) -> np.ndarray:
-    """A mask of a coarse image, uint8, in the pixels of the image, bool of its shape; ``k`` pixels a sample."""
-    full = cv2.resize(mask, None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(full[: shape[0], : shape[1]] > 0)
-
-
 def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
     """Points (n, 3) of a coarse image that lie on a plane, of the largest connected part: the tops of two cartons may
     lie in one plane."""
-    k, rows, columns, points = coarse(depth, valid, camera)
+    k, rows, columns, points = coarse_grid.samples(depth, valid, camera)
     on = _lie_on(plane, points)
-    part = connected_parts(rows, columns, on, depth[::k, ::k].shape)
+    part = coarse_grid.connected_parts(rows, columns, on, depth[::k, ::k].shape)
     counts = np.bincount(part)
     counts[0] = 0
     return np.asarray(points[on & (part == counts.argmax())])

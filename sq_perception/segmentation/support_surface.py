@@ -31,13 +31,11 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import coarse_grid
 from sq_perception.segmentation.support_plane import (
     LEAST_GROWTH,
     TOLERANCE,
     Plane,
-    coarse,
-    coarse_stride,
-    in_pixels,
     noise_growth,
 )
 
@@ -117,7 +115,7 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    points = coarse(depth, valid, camera)[3]
+    points = coarse_grid.samples(depth, valid, camera)[3]
     z = points[:, 2]
     x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
     height = plane.height(points) / growth
@@ -154,7 +152,7 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     camera
         As in :func:`measured`.
     """
-    k = coarse_stride(depth.shape)
+    k = coarse_grid.stride(depth.shape)
     share = _cells(valid.astype(np.float32), k)
     known = share > 0.5
     weight = 1 / np.maximum(share, np.float32(0.5))
@@ -178,7 +176,7 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     is_lit = np.bincount(near[raised], minlength=len(beside)) > _ALL_AROUND * beside
     is_lit[0] = False
     reached &= ~_parts_with(raised, raised & ~short) | _parts_with(raised, raised & is_lit[near])
-    return in_pixels(reached.view(np.uint8), k, depth.shape)
+    return coarse_grid.in_pixels(reached.view(np.uint8), k, depth.shape)
 
 
 def _climbed(
