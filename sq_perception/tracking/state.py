@@ -40,7 +40,8 @@ class Observed(Protocol):
     ``superquadric`` is a single body in the optical frame.  ``covariance`` is (11, 11), of a1 a2 a3 e1 e2 t1 t2 t3 and
     the rotation vector in the object frame, metres and radians; NaN where unknown.  ``is_predicted`` tells that much of
     it is a prediction's, which errs alike from everywhere.  ``repeats`` is above 0 for an answer that was given before,
-    of readings that are the same but for noise: its error is the same, too.
+    of readings that are the same but for noise: its error is the same, too.  ``seen`` (3,) is the share, 0 to 1, of
+    each size that the measured points span.
     """
 
     @property
