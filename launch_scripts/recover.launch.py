@@ -92,7 +92,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
 
 
 def _rviz(given: dict[str, str], namespace: str) -> Node:
-    """RViz2 on the topics of the camera in a namespace: its configuration names those of the demonstration."""
+    """RViz2 on the topics of the camera in a namespace: its configuration names those of recover_node."""
     share = PathJoinSubstitution([FindPackageShare("sq_perception"), "config", "superquadrics.rviz"])
     return Node(
         package="rviz2",

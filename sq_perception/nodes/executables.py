@@ -29,7 +29,7 @@ _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 def _run(name: str, arguments: Sequence[str] | None = None) -> int:
-    return process.run(name, lambda: [_node(name)], arguments)
+    return process.run(name, lambda: [create_node(name)], arguments)
 
 
 recover_node = partial(_run, "recover_node")
@@ -53,7 +53,7 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
     def create() -> Iterator[process.Stoppable]:
         names: dict[str, str] = {}
         for camera in cameras:
-            node = _node("recover_node", camera)
+            node = create_node("recover_node", camera)
             yield node
             other = names.setdefault(node.get_fully_qualified_name(), camera)
             if other != camera:
@@ -65,7 +65,8 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
     return process.run("recover_cameras", create, given[cut:])
 
 
-def _node(name: str, namespace: str | None = None) -> process.Stoppable:
+def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
+    """One of this package's nodes, by the name of its program."""
     if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 

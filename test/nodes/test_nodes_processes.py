@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from children import Child, command
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from running_nodes import BODIES, CAMERA, PATIENCE, Peer, arguments, environment, nanoseconds, until
@@ -21,7 +22,6 @@ from std_srvs.srv import SetBool
 
 from sq_msgs_py.depth_image import depth_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.commands.children import Child, command
 from sq_perception.geometry.metrics import thesis_iou, volume_iou
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.publication import superquadrics
