@@ -22,14 +22,10 @@ CONFIRM_AFTER = 3
 """Observations until a track is confirmed: one more than may disagree by chance.  Chosen."""
 FORGET_POSE_AFTER = 5.0
 """Seconds without observation until a body may be anywhere within reach.  Chosen."""
-_MOTION_SHARE = 0.5
-"""Standard deviation of a predicted motion, as a share of it: hands speed up and stop.  Chosen."""
-_MOVING_TURN = 0.3
-"""Radians in a second that a moving body may turn, standard deviation.  Chosen."""
+HAND = 1.0
+"""Metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down."""
 _COASTING = 1.0
 """Seconds that an unseen body is taken to go on as it was seen to move.  Chosen."""
-_UNPLACED = 1.0
-"""Metres and radians: deviation of a pose that is forgotten, farther than things are carried."""
 
 
 class TrackState(Enum):
@@ -131,11 +127,11 @@ class Body:
         if velocity.any():
             step = velocity * elapsed
             state[5:8] += step
-            variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
-            variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
+            variance[CENTRE] += step @ step  # hands speed up and stop
+            variance[TURN] += HAND**2 * min(elapsed, 1.0)
         if stamp - self.last > FORGET_POSE_AFTER:
             # Once: however many frames pass meanwhile, it cannot be forgotten more.
-            variance[POSE] += np.maximum(_UNPLACED**2 - np.diag(estimate.covariance)[POSE], 0.0)
+            variance[POSE] += np.maximum(HAND**2 - np.diag(estimate.covariance)[POSE], 0.0)
         return replace(
             self,
             estimate=estimate._replace(state=state, covariance=estimate.covariance + np.diag(variance)),

@@ -31,7 +31,7 @@ from sq_perception.tracking import association, fusion, gating, state, visibilit
 from sq_perception.tracking.association import Pairs
 from sq_perception.tracking.fusion import Estimate, Observation
 from sq_perception.tracking.state import CENTRE, LENGTH, TURN, Observed
-from sq_perception.tracking.track import CONFIRM_AFTER, Body, Track, TrackState, stack
+from sq_perception.tracking.track import CONFIRM_AFTER, HAND, Body, Track, TrackState, stack
 
 __all__ = ["Track", "TrackState", "Tracker"]
 
@@ -50,8 +50,6 @@ UNKNOWN = 0.15, 0.2, 0.15, 0.2
 covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
-FASTEST = 1.0
-"""Metres per second: how far a body may have been moved since its track last followed it.  A hand sets things down."""
 MISSES = 5
 """Frames in a row that should have shown it after which a confirmed track dies; a tentative one after two.  Chosen: a
 sixth of a second at 30 Hz."""
@@ -59,8 +57,6 @@ FORGET_AFTER = 30.0
 """Seconds without observation until a body is given up.  Chosen."""
 MOST = 100
 """Tracks that are kept; beyond them those die first that were not observed for longest.  Bounds the time of a frame."""
-_RESTART = 3.0
-"""A restarted pose is unsure by this many times the displacement.  Chosen."""
 _Bodies = tuple[Body, ...]
 
 
@@ -230,7 +226,7 @@ def _pairs_elsewhere(bodies: _Bodies, frame: _Frame, here: Pairs, missing: np.nd
         return Pairs.none()
     absent = [bodies[k] for k in left]
     states, covariances = stack(absent)
-    reach = FASTEST * np.array([frame.stamp - body.agreed for body in absent])
+    reach = HAND * np.array([frame.stamp - body.agreed for body in absent])
     is_free = missing[left] | np.array([body.is_moving for body in absent], dtype=bool)
     reach = np.where(is_free, reach, np.minimum(reach, 2 * states[:, 0:3].max(axis=1)))
     there = association.pairs_elsewhere(
@@ -320,7 +316,7 @@ def _doubt(
         if is_out_of_patience and verdict.fits[k] and (slid or turned):
             turning[k] = turned
             for part, has_moved in ((CENTRE, slid), (TURN, turned)):
-                variance = (_RESTART * np.linalg.norm(error[k, part])) ** 2 if has_moved else 0.0
+                variance = error[k, part] @ error[k, part] if has_moved else 0.0
                 covariances[k, part, part] += variance * np.eye(3)
         else:
             # One stray observation is doubted itself; of several in a row, both sides are.
@@ -349,7 +345,7 @@ def _velocity(body: Body, error: np.ndarray, slid: bool, stamp: float, covarianc
         return velocity if np.linalg.norm(velocity) * elapsed > still else np.zeros(3)
     if slid and body.jumps != 1:
         velocity = error / elapsed
-        return velocity * min(1.0, FASTEST / float(np.linalg.norm(velocity)))
+        return velocity * min(1.0, HAND / float(np.linalg.norm(velocity)))
     return body.velocity
 
 
