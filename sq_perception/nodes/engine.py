@@ -29,7 +29,7 @@ from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.recovery import still_scene
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
-from sq_perception.recovery.still_scene import Reference
+from sq_perception.recovery.still_scene import Reference, StillScene
 from sq_perception.segmentation.options import Pose
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -170,10 +170,10 @@ class Engine:
         key = frame.header.frame_id, origin
         last = self._last.get(key) if parameters.tracking else None
         options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
-        readings = built.recoverer.read(frame.depth, frame.camera, frame.labels, options)
-        found = still_scene.follow(built.recoverer, readings, last)
-        self._last = {key: found}
-        return found.recovery, origin
+        scene = StillScene(built.recoverer, last)
+        recovery = scene.recover(frame.depth, frame.camera, frame.labels, options)
+        self._last = {} if scene.last is None else {key: scene.last}
+        return recovery, origin
 
     @property
     def description(self) -> str:

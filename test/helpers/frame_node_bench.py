@@ -58,14 +58,17 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         self.warm = camera
 
-    def recover(
-        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any, previous: Any = None
-    ) -> FrameRecovery:
+    def recover(self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any) -> FrameRecovery:
         self.asked.append((depth, camera, labels, options))
         assert self.gate.wait(PATIENCE)
         if self.error is not None:
             raise self.error
         return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), self.plane, self.message)
+
+
+def every_frame_anew(recoverer: Any, last: Any) -> Any:
+    """A stand-in for a StillScene that repeats nothing."""
+    return SimpleNamespace(recover=recoverer.recover, last=None)
 
 
 class Bench(SpunNodes):
@@ -75,7 +78,8 @@ class Bench(SpunNodes):
         super().__init__(*arguments)
         self.recoverer = Recoverer()
         weights = SimpleNamespace(resolve=lambda _: Path(f"weights of {id(self)}"), check=lambda _: None)
-        self.stand_ins = patch.multiple(engine, Recoverer=lambda *_, **__: self.recoverer, checkpoint=weights)
+        made = {"Recoverer": lambda *_, **__: self.recoverer, "StillScene": every_frame_anew}
+        self.stand_ins = patch.multiple(engine, checkpoint=weights, **made)
         self.stand_ins.start()
         self.node = FrameNode("recover_node", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
