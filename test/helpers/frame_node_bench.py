@@ -88,7 +88,7 @@ class Bench(SpunNodes):
         self.spin([self.node])
         self.until(lambda: self.node.is_active)
         if self.node._settings.current.image_transport == "raw":
-            self.until(lambda: self.images.get_subscription_count() == 1)
+            self.until(self.images.get_subscription_count)
         self.until(lambda: self.node._outputs.superquadrics.get_subscription_count() == 1)
         self.stamps = 0
 
@@ -118,7 +118,7 @@ class Bench(SpunNodes):
         return intrinsics_to_message(known, self.header())
 
     def put_info(self, message: CameraInfo) -> None:
-        self.until(lambda: self.infos.get_subscription_count() == 1)
+        self.until(self.infos.get_subscription_count)
         before = sum(1 for _ in self.node._input._infos)
         assert before < self.node._input._infos.maxlen
         self.infos.publish(message)
