@@ -24,7 +24,6 @@ COMMANDS = {
     "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
     "render": ("render:main", "draw a superquadric as a depth image"),
     "demo": ("demo:main", "live demonstration with real ROS 2 nodes (extra 'ros')"),
-    "view": ("view:main", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
     "train": ("train:main", "train a network"),
     "thing-views": ("shards:thing_views", "draw views of household things to train on"),
     "train-things": ("shards:train_things", "train the network that predicts the unseen side of things"),

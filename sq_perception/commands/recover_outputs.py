@@ -23,8 +23,8 @@ from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.tracking.session import Followed
 
 if TYPE_CHECKING:
+    from sq_perception.recordings.html_page import HtmlPage
     from sq_perception.recordings.result_bag import ResultBag
-    from sq_perception.recordings.still_page import StillPage
 
 _FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
@@ -97,15 +97,15 @@ class Outputs:
         self._not_in_bag: list[str] = []
         """Why frames are not in the bag."""
         self._bag: ResultBag | None = None
-        self._page: StillPage | None = None
+        self._page: HtmlPage | None = None
         self._lines = _lines(options)
         self.done = [] if self._lines is None else self._lines.done
         try:
             self._bag = _bag(options)
             if options.html:
-                from sq_perception.recordings.still_page import StillPage
+                from sq_perception.recordings.html_page import HtmlPage
 
-                self._page = StillPage(options.html)
+                self._page = HtmlPage(options.html)
         except BaseException:  # nothing is left of those that were begun
             for output in (self._lines, self._bag, self._page):
                 if output is not None:

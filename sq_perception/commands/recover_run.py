@@ -23,6 +23,7 @@ from sq_perception.recordings.tracks import RecordedTracks, sequence_of
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.recovery.still_scene import StillScene
 
 
 def run(options: argparse.Namespace) -> int:
@@ -167,7 +168,7 @@ class RecoverRun:
             works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
             yield from workers.recovered(works, executor)
             return
-        previous: FrameRecovery | None = None
+        scene = StillScene(executor)
         sequence, is_warm = ("", ""), False
         for pair in pairs:
             answer: Any = None
@@ -177,10 +178,10 @@ class RecoverRun:
                         executor.warm_up(frame.camera)
                         is_warm = True
                     if sequence != (of_frame := sequence_of(pair[0], frame)):
-                        sequence, previous = of_frame, None
+                        sequence, scene = of_frame, StillScene(executor)
                     work = self._work(frame)
-                    answer = executor.recover(work.depth, work.camera, work.labels, work.options, previous)
-                    previous = answer if self._tracks else None
+                    following = scene if self._tracks else executor
+                    answer = following.recover(work.depth, work.camera, work.labels, work.options)
                 except (ValueError, ArithmeticError) as error:
                     answer = error
             yield pair, answer

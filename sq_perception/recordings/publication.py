@@ -20,15 +20,14 @@ from sq_msgs_py import poses
 from sq_msgs_py.depth_image import depth_from_message, depth_to_message, grey_from_message, grey_to_message
 from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.message_types import MessageTypes, installed
-from sq_msgs_py.superquadrics import CONVERGED, FAILED, WEAK, Reason, SuperquadricArray
+from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.geometry.mesh import COLOURS, MARKER_RESOLUTION, outline, triangles
+from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
-from sq_perception.viewing.drawings import Bodies
 
 CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
 """Frame ids of images that bring none."""
@@ -227,20 +226,6 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
 def superquadrics(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, in its frame."""
     return Superquadric(**{name: getattr(array, name).astype(float) for name in _OF_A_BODY})
-
-
-def drawn(array: SuperquadricArray, bodies: Superquadric) -> Bodies:
-    """What a page draws of a message whose bodies, without failed ones, are these (n,) in the optical frame."""
-    shown = array.recovered
-    return Bodies(
-        superquadrics=bodies,
-        sigma_size=shown.sigma_size.astype(float),
-        score=np.nan_to_num(shown.score.astype(float)),
-        ids=shown.id.tolist(),
-        is_weak=(shown.status == WEAK).tolist(),
-        colours=COLOURS[shown.id % len(COLOURS)],
-        failed=(array.id[array.status == FAILED] % FIRST_FAILED_ID).tolist(),
-    )
 
 
 def covariances(array: SuperquadricArray) -> np.ndarray:
