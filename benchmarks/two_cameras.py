@@ -105,7 +105,9 @@ def verdicts(seed: int, sensor: str | None, masks: str) -> list[dict[str, dict[s
                 continue
             body, sigma = track.superquadric, track.sigma_size
             answer = scene_verdict.answer(body, placed, first, sigma)
-            inside = [each for each in tracks if np.linalg.norm(each.superquadric.translation - body.translation) < 0.03]
+            inside = [
+                each for each in tracks if np.linalg.norm(each.superquadric.translation - body.translation) < 0.03
+            ]
             rows[name] = {
                 "weak": bool(undetermined(track.covariance, body.size).any()),
                 "edge": answer.size_error,

@@ -11,12 +11,13 @@ from typing import Any
 
 from sq_perception.commands import console
 from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, failed, misused
-from sq_perception.commands.recover_lines import lines
+from sq_perception.commands.recover_lines import lines, scene_lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
 from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
+from sq_perception.recordings.camera_poses import CameraPoses
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recordings.tracks import RecordedTracks, sequence_of
@@ -32,6 +33,8 @@ def run(options: argparse.Namespace) -> int:
         return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
         return misused("--json, --jsonl, --csv: only one of them can be the standard output")
+    if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
+        return misused("--poses: expected a pinhole camera, and a method that says how sure it is: auto or symmetry")
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
     try:
@@ -41,11 +44,12 @@ def run(options: argparse.Namespace) -> int:
     except ValueError as error:
         return misused(str(error))
     code = this.over_all_frames()
+    this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
         complain(problem)
         code = code or FAILURE
     if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
-        for line in lines(this.outputs.results, options.verbose):
+        for line in (*lines(this.outputs.results, options.verbose), *scene_lines(this.outputs.scene)):
             print(line)
     if not options.quiet:
         complain(this.summary())
@@ -106,7 +110,9 @@ class RecoverRun:
         self._executor = self._chosen_executor()
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
-        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
+        poses = CameraPoses(options.poses) if options.poses else None
+        is_tracked = options.track or poses is not None
+        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}"), poses) if is_tracked else None
         self._unreadable = 0
         self._warnings: dict[str, set[str]] = {}
 
@@ -142,6 +148,10 @@ class RecoverRun:
                     complain(f"warning: {_count(len(files) - 1, 'more file')}: {warning}")
         self.is_whole = True
         return FAILURE if self._unreadable else console.SUCCESS
+
+    def scene(self) -> list[dict[str, Any]]:
+        """The bodies of all frames together, with camera poses."""
+        return [result_json.scene_entry(track) for track in self._tracks.scene] if self._tracks else []
 
     def summary(self) -> str:
         """The run in one line."""

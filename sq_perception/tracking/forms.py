@@ -78,7 +78,7 @@ def nearest(
 
 
 def loosen_pose(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Covariances (n, 11, 11) of bodies that were carried by about ``distance`` (n,) metres, and may have been rotated."""
+    """Covariances (n, 11, 11) of bodies that were carried by ``distance`` (n,) metres and may have been rotated."""
     variance = np.zeros((len(covariance), LENGTH))
     variance[:, POSE] = np.concatenate([np.tile(distance[:, None], 3), np.full((len(covariance), 3), _HAND)], axis=1)
     return covariance + variance[:, :, None] ** 2 * np.eye(LENGTH)

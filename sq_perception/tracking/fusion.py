@@ -4,8 +4,8 @@ An observation z of the state x with covariance R, seen from the direction c in 
 
     z = x + g + b_c + v,    cov g = gamma R,    cov b_c = B = rho R + F,    cov v = W = (1 - rho - gamma) R.
 
-v is new in every frame.  b_c is common to all views from within VIEW_ANGLE of c: what a still camera sees wrongly again
-and again, such as an outline, a wrong hidden side, or a thing that is no superquadric; F is its least.  It is considered
+v is new in every frame.  b_c is common to all views from within VIEW_ANGLE of c: what a still camera sees wrongly every
+time, such as an outline, a wrong hidden side, or a thing that is no superquadric; F is its least.  It is considered
 and not estimated (Schmidt 1966): with the covariance P of x^ - x its correlation C_c = cov(x^ - x, b_c) with each view
 is kept, and
 
@@ -44,8 +44,8 @@ VIEW_ANGLE = 0.25
 VIEWS = 16
 """Directions that are kept for each body: two thirds of a circle at VIEW_ANGLE."""
 _BETTER = 4.0
-"""Ratio of variances: a look that halves a deviation is far better.  Chosen: of 224 looks at eight simulated bodies that
-nothing hid, the least sure first look had 2.1 times a later one's."""
+"""Ratio of variances: a look that halves a deviation is far better.  Chosen: of 224 looks at eight simulated bodies
+that nothing hid, the least sure first look had 2.1 times a later one's."""
 
 
 class Estimate(NamedTuple):

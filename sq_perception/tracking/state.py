@@ -29,7 +29,7 @@ _LIMITS = np.array([[1e-3] * 3 + [0.01] * 2, [np.inf] * 3 + [2.0] * 2])
 
 
 class Observed(Protocol):
-    """What the tracker needs to know of a body in one frame; :class:`~sq_perception.recovery.recoverer.Recovery` has it.
+    """What the tracker needs of a body in one frame; :class:`~sq_perception.recovery.recoverer.Recovery` has it.
 
     ``superquadric`` is a single body in the optical frame and ``covariance`` (11, 11) that of its error, NaN where
     unknown.  ``is_predicted``: a network's prediction is part of it, whose error is much the same from every side.

@@ -6,7 +6,7 @@ Observations come in the optical frame with the pose of the camera in the world;
 2. Association (:mod:`~sq_perception.tracking.association`), in the form that continues the track
    (:mod:`~sq_perception.tracking.forms`).
 3. Fusion (:mod:`~sq_perception.tracking.fusion`) where both agree (:mod:`~sq_perception.tracking.gating`).  A single
-   observation that disagrees counts little.  After several in a row that disagree in the pose alone the body has moved:
+   observation that disagrees counts little.  After several in a row that disagree in the pose alone the body has moved,
    its pose starts again, its sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too.  An
    answer that repeats an earlier one shows that a body at rest is still there, and no more.
 4. Birth: observations without a track start one; ids are never used again.
@@ -44,7 +44,7 @@ degrees about them, 90 instead of 84 % of the half sizes are within two deviatio
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
 _LEAST_WHITE = 1e-6
-"""Share of F that is new in every observation at least: with exact ones, such as a simulator's, S has no inverse else."""
+"""Share of F that is new in every observation: of exact ones, such as a simulator's, S has no inverse without it."""
 UNKNOWN = 0.15, 0.2, 0.15, 0.2
 """Deviations (sizes as shares, exponents, centre as a share of the mean half size, turn) of observations without
 covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
@@ -61,8 +61,8 @@ _Bodies = tuple[Body, ...]
 
 
 class _Frame(NamedTuple):
-    """m observations in the world: states (m, 12), covariances (m, 11, 11), gamma (m,), directions to the camera (m, 3),
-    and which repeat an earlier answer (m,)."""
+    """m observations in the world: states (m, 12), covariances (m, 11, 11), gamma (m,), directions to the camera
+    (m, 3), and which repeat an earlier answer (m,)."""
 
     stamp: float
     state: np.ndarray

@@ -1,7 +1,7 @@
 """Whether a body that was not observed should have been, and from where a body is seen.
 
-26 points of the surface, in the directions of a cube's faces, edges and corners, stand for a body; those on the far side
-do not count.  A point is evidence of absence only where the image measured something farther away: beyond the image,
+26 points of the surface, in the directions of a cube's faces, edges and corners, stand for a body; those on the far
+side do not count.  A point is evidence of absence only where the image measured something farther away: beyond the image,
 where nothing was measured, and where something lies in front or in the body's place, nothing shows that it has gone.
 
 Optical frame, metres.
@@ -18,8 +18,8 @@ from sq_perception.imaging.camera import Camera
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
 _TOLERANCE = 0.25
-"""Share of the smallest half size by which depths differ that are the body's own.  Chosen: above noise and misfit, below
-a thing that stands behind."""
+"""Share of the smallest half size by which depths differ that are the body's own.  Chosen: above noise and misfit,
+below a thing that stands behind."""
 
 
 def is_missing(
