@@ -1,8 +1,8 @@
 """Ids for bodies of recorded frames: a tracking session over each sequence that a user names.
 
 A sequence is a topic of a bag, or the frames of one folder, in their order, of a camera that stands still.  Where
-frames have no stamp they are taken to be INTERVAL apart.  With camera poses all frames are views of one scene that rests, of
-whatever cameras and stamps.
+frames have no stamp they are taken to be INTERVAL apart.  With camera poses all frames show one scene that rests,
+whatever their cameras and stamps are.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ Its cost is the negative logarithm of a Student density with n degrees of freedo
 
     cost = 2 n log(1 + d^2 / n) + log det S,
 
-like that of a normal density close by, and moderate for bodies that moved.  The assignment of least total cost is taken;
+like that of a normal density close by, and moderate for bodies that moved.  The assignment of least cost is taken;
 what is left alone costs as much as a pair at d = 100: a pair close by is not given up for two far apart.
 
 What is left over may have been moved by more than its own size.  It is the same body if its sizes and exponents agree

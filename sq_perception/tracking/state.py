@@ -25,7 +25,7 @@ DETERMINED = 0.2
 """Standard deviation in radians up to which a rotation about an axis counts as measured.  Chosen: three of them stay
 below the 45 degrees at which another axis of the body is nearer."""
 _LIMITS = np.array([[1e-3] * 3 + [0.01] * 2, [np.inf] * 3 + [2.0] * 2])
-"""Least and greatest sizes (metres) and exponents that a correction leaves; bodies are convex up to an exponent of 2."""
+"""Least and greatest sizes (metres) and exponents that a correction leaves; bodies are convex up to exponents of 2."""
 
 
 class Observed(Protocol):

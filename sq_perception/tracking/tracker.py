@@ -7,8 +7,8 @@ Observations come in the optical frame with the pose of the camera in the world;
    (:mod:`~sq_perception.tracking.forms`).
 3. Fusion (:mod:`~sq_perception.tracking.fusion`) where both agree (:mod:`~sq_perception.tracking.gating`).  A single
    observation that disagrees counts little.  After several in a row that disagree in the pose alone the body has moved,
-   its pose starts again, its sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too.  An
-   answer that repeats an earlier one shows that a body at rest is still there, and no more.
+   its pose starts again, its sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too.
+   An answer that repeats an earlier one shows that a body at rest is still there, and no more.
 4. Birth: observations without a track start one; ids are never used again.
 5. Death: after some frames in a row in which a body should have been seen (:mod:`~sq_perception.tracking.visibility`)
    or another one was seen in its place.  Hidden bodies are kept for a while.

@@ -1,7 +1,7 @@
 """Whether a body that was not observed should have been, and from where a body is seen.
 
 26 points of the surface, in the directions of a cube's faces, edges and corners, stand for a body; those on the far
-side do not count.  A point is evidence of absence only where the image measured something farther away: beyond the image,
+side do not count.  A point is evidence of absence only where the image measured something farther: beyond the image,
 where nothing was measured, and where something lies in front or in the body's place, nothing shows that it has gone.
 
 Optical frame, metres.
