@@ -334,7 +334,7 @@ class FrameNode(ManagedNode):
         source, parameters = self._input, self._settings.current
         silent = False
         if source is not None:
-            source.look_for_latched()
+            source.follow_publishers()
             silent = 0 < parameters.no_frame_warning < source.silence
             if silent:
                 text = f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}"
