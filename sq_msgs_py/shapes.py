@@ -124,7 +124,7 @@ def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, 
     ValueError
         If the mesh is not around the origin with its faces outwards, or the body is none.
     """
-    size, (e1, e2) = _checked(size, shape)
+    size, shape = _checked(size, shape)
     vertices, faces = _checked_mesh(vertices, faces)
     corners = (vertices / size)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -136,9 +136,13 @@ def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, 
     distance = np.einsum("ij,ij->i", normals, corners[is_face, 0])
     if (distance <= 0).any():
         raise ValueError("mesh: expected the origin inside and the faces outwards")
-    x, y, z = np.abs(normals).T
-    support = _dual(_dual(x, y, e2), z, e1)
-    return max(float((support / distance).max()), 1.0)
+    return max(float((support(normals, np.ones(3), shape) / distance).max()), 1.0)
+
+
+def support(normals: np.ndarray, size: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """How far a body reaches from its centre along directions (k, 3) of its own frame: (k,), times their lengths."""
+    x, y, z = np.abs(normals * size).T
+    return _dual(_dual(x, y, shape[1]), z, shape[0])
 
 
 def _largest(c: float, d: float, e: float) -> float:

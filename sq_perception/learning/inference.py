@@ -11,6 +11,7 @@ torch is imported where it computes.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -184,21 +185,16 @@ def checked_device(device: str) -> str:
     Raises
     ------
     ValueError
-        If it is not the cpu and there is no torch, or torch does not know the name or sees no such device.
+        If it is none of cpu, cuda and cuda:N, or not the cpu and there is no torch, or torch sees no such device.
     """
     if device == "cpu":
         return device
+    if (known := re.fullmatch(r"(cpu|cuda)(?::(\d+))?", device)) is None:
+        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
     try:
         import torch
     except ModuleNotFoundError as error:
         raise ValueError(f"device: {device!r} {NEEDS_TORCH}") from error
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise ValueError(f"device: {error}") from error
-    if kind not in ("cpu", "cuda"):
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
-    if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
-        count = torch.cuda.device_count()
+    if known[1] == "cuda" and int(known[2] or 0) >= (count := torch.cuda.device_count()):
         raise ValueError(f"device: {device!r} was asked for, but torch sees {count} CUDA devices here")
     return device
