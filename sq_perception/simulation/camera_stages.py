@@ -47,7 +47,7 @@ class StageRanges:
     frames: tuple[int, int] = (2, 4)
     """A still scene: with the default of a = 0.4, four frames weigh 87 %."""
     decimation: float = 0.1
-    spatial: float = 0.35
+    spatial: float = 0.45
     factor: tuple[float, float] = (0.25, 1.0)
     """a, of both filters; librealsense: 0.25 to 1, by default 0.5."""
     threshold: tuple[float, float] = (1.0, 50.0)
@@ -56,10 +56,13 @@ class StageRanges:
     """librealsense: 1 to 5, by default 2."""
     disparity: tuple[float, float] = (15.0, 80.0)
     """f b, pixels times metres, by which steps are counted: 21 for a D435 at 848 x 480, 87 for a D455 at 1280 x 720."""
-    ring: float = 0.35
+    ring: float = 0.45
     outer: tuple[int, int] = (1, 6)
     """Pixels, at VGA 2 to 5 in recorded frames of an Xtion and a Kinect v1."""
-    inner: tuple[int, int] = (0, 2)
+    both_sides: float = 0.2
+    """Share of the rings that cost the near side readings too.  What a second eye does not see, or a window mixes with
+    what is nearer, is behind; mixed pixels of time of flight are on both sides."""
+    inner: tuple[int, int] = (1, 2)
     edge: tuple[float, float] = (0.02, 0.08)
     """Step in depth from pixel to pixel beside which readings are lost, as a share of the depth."""
     foot: float = 0.5
@@ -267,7 +270,7 @@ def draw_stages(rng: np.random.Generator, ranges: StageRanges = RANGES) -> Stage
         threshold=steps,
         rounds=int(rng.integers(*ranges.rounds, endpoint=True)) if whether(ranges.spatial) else 0,
         outer=int(rng.integers(*ranges.outer, endpoint=True)) if has_ring else 0,
-        inner=int(rng.integers(*ranges.inner, endpoint=True)) if has_ring and whether(0.5) else 0,
+        inner=int(rng.integers(*ranges.inner, endpoint=True)) if has_ring and whether(ranges.both_sides) else 0,
         edge=rng.uniform(*ranges.edge),
         foot=whether(ranges.foot),
         filling=get_args(Filling)[rng.integers(3)] if whether(ranges.filling) else None,

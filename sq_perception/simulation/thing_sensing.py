@@ -60,7 +60,7 @@ def measured_by_any(
         measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:
         measured[seen & _turned_aside(depth, camera, rng)] = np.nan
-    if rng.random() < 0.35:
+    if rng.random() < 0.25:
         measured[_edges(depth, rng)] = np.nan
     if rng.random() < 0.1:
         measured[seen & _contours(depth, seen, rng)] = np.nan
