@@ -26,6 +26,7 @@ from sq_perception.geometry.threads import one_torch_thread
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
+from sq_perception.learning.mirror_images import predicted_both_ways
 from sq_perception.learning.network_config import (
     MaskConfig,
     RegressorConfig,
@@ -130,13 +131,13 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     """
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
-        return forward.CompactRegressor(config, weights)
+        return _BothWays(forward.CompactRegressor(config, weights))
     try:
         model = checkpoint.load(path, device).for_inference()
     except ModuleNotFoundError as error:
         what = f"a network of the backbone {config.backbone} on {device}"
         raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
-    return _OnOneThread(model) if _is_cpu(device) else model
+    return _BothWays(_OnOneThread(model) if _is_cpu(device) else model)
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
@@ -161,6 +162,17 @@ def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
         As :func:`checkpoint.read`.
     """
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
+
+
+class _BothWays:
+    """A predictor of bodies that is shown each view and its mirror image, as one batch."""
+
+    def __init__(self, model: Predictor) -> None:
+        self.config = model.config
+        self._model = model
+
+    def predict(self, views: np.ndarray) -> Superquadric:
+        return predicted_both_ways(self._model.predict, checked_views(views, self.config))
 
 
 class _OnOneThread:
