@@ -158,7 +158,7 @@ def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: i
 
 def _reach(bodies: SuperquadricArray, k: int) -> np.ndarray:
     turn = matrices(unit_quaternions(bodies.rotation[k]))
-    return support(_DIRECTIONS @ turn, bodies.size[k], bodies.shape[k])
+    return support(_DIRECTIONS @ turn, bodies.size[k], bodies.shape[k], bodies.taper[k])
 
 
 def collision_objects(
@@ -200,7 +200,7 @@ def collision_objects(
             added.primitives, added.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
         else:
             vertices, faces = meshes[k]
-            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k])
+            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k], bodies.taper[k])
             added.meshes, added.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
         objects.append(added)
     return objects
