@@ -65,8 +65,8 @@ def yaml_text(name: str) -> str:
     ]
     if issubclass(kind, RecoverParameters):
         lines += [
-            "# Inputs keep the last message and are as reliable as all publishers of their topic are. For instance",
-            "# qos_overrides./depth/image.subscription.reliability: best_effort changes that (also .history and .depth;",
+            "# Inputs keep the last message and are as reliable as all publishers of their topic are; for instance",
+            "# qos_overrides./depth/image.subscription.reliability: best_effort changes that (also .history, .depth;",
             "# the topic's name is the one after remapping).",
         ]
     lines += ["/**:", "  ros__parameters:"]
