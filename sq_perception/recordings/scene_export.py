@@ -18,7 +18,7 @@ of half length l, radius r) wherever its support function is at most r + l |n_z|
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 
@@ -72,11 +72,11 @@ def grown(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Super
     if not np.isfinite(covariances).all():
         raise ValueError("covariances: expected finite ones; methods without a fit's covariance have none to grow by")
     along = np.swapaxes(bodies.rotation_matrix, -1, -2)  # the centre along the body's axes
-    jacobian = np.zeros((2, *bodies.batch_shape, 3, 11))  # of both sides
+    jacobian = np.zeros((2, *bodies.batch_shape, 3, covariances.shape[-1]))  # of both sides
     jacobian[..., :3], jacobian[..., 5:8] = np.eye(3), [along, -along]
     variances = np.einsum("snij,njk,snik->sni", jacobian, covariances, jacobian)
     deviation = np.sqrt(variances.max(axis=0).clip(min=0))
-    return Superquadric(bodies.size + sigmas * deviation, bodies.shape, bodies.translation, bodies.rotation)
+    return replace(bodies, size=bodies.size + sigmas * deviation)
 
 
 def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = None, meshes: bool = False) -> list[Solid]:
@@ -93,7 +93,8 @@ def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = Non
     if len(set(names)) != len(bodies):
         raise ValueError(f"names: expected {len(bodies)} different ones, got {names}")
     found = []
-    for name, body in zip(names, bodies, strict=True):
+    straight = getattr(bodies, "untapered", lambda: bodies)()  # encloses one that tapers
+    for name, body in zip(names, straight, strict=True):
         turn = rotation.normalize(np.asarray(body.rotation, dtype=float))
         if meshes:
             vertices, faces = triangles(Superquadric.at_origin(body.size, body.shape), MARKER_RESOLUTION)
