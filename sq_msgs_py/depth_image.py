@@ -1,8 +1,8 @@
 """sensor_msgs/Image and CameraInfo to NumPy and back.
 
-Depth follows REP 118: 16UC1 holds millimetres with 0 for "no reading", 32FC1 holds metres with NaN.  In NumPy a depth
-image is always float32 (height, width) in metres, NaN where nothing was measured.  Pixels are read in place through
-their row stride (``step``) and byte order (``is_bigendian``); only the conversion to metres copies.
+Depth follows REP 118: 16UC1 holds millimetres with 0 for "no reading", 32FC1 holds metres with NaN; what is read are
+the numbers as they stand (:mod:`sq_perception.imaging.depth_units` makes metres of them), in place, through their row
+stride (``step``) and byte order (``is_bigendian``).
 
 What reads a message only looks at its fields, so that messages of rosbags, which come without a ROS installation, are
 read by the same code.  What makes one takes its class from ``types``, by default that of the ROS installation.
@@ -38,7 +38,6 @@ _DTYPES: dict[str, type[Any]] = {
 }
 _LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1e-2, 1e6
 """What no camera goes beyond; lines of sight computed with less or more are no longer numbers."""
-_MILLIMETRES = np.float32(1000.0)
 
 
 class ImageError(ValueError):
@@ -72,22 +71,6 @@ def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYP
             f"data: expected height x step = {height} x {step} = {height * step} bytes, got {len(message.data)}"
         )
     return np.ndarray((height, width), dtype, buffer=memoryview(message.data), strides=(step, dtype.itemsize))
-
-
-def depth_from_message(message: Image) -> np.ndarray:
-    """Depth in metres, float32 (height, width), of a 16UC1 or 32FC1 image; 0, negative, NaN and infinite become NaN.
-
-    Raises
-    ------
-    ImageError
-        As :func:`pixels_from_message`.
-    """
-    pixels = pixels_from_message(message, DEPTH_ENCODINGS)
-    depth = pixels.astype(np.float32)
-    if message.encoding == "16UC1":
-        depth /= _MILLIMETRES
-    depth[~((depth > 0) & (depth < np.inf))] = np.nan
-    return depth
 
 
 def grey_from_message(message: Image) -> np.ndarray:

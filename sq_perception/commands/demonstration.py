@@ -31,7 +31,6 @@ from sq_perception.imaging.camera import Projection
 from sq_perception.nodes import fast_dds
 from sq_perception.nodes.watch import CAMERA, Shot, Watch
 from sq_perception.recordings.frame_file import FrameError, read
-from sq_perception.recordings.inputs import camera_beside
 
 _RATE = 10.0
 _START_PATIENCE = 120.0
@@ -111,7 +110,7 @@ def _camera(frame: Path | None, camera_info: Path | None, projection: Projection
     if projection is None:
         projection = "orthographic" if _is_grey(frame) else "pinhole"
     # An NPZ may be of the unit cube, whatever was expected of it.
-    is_cube = read(frame, camera_info or camera_beside(frame), projection).is_cube
+    is_cube = read(frame, camera_info, projection).is_cube
     files = {"path": str(frame.resolve())}
     if camera_info is not None:
         files["camera_info_file"] = str(camera_info.resolve() if camera_info.exists() else camera_info)

@@ -66,16 +66,23 @@ def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, Fra
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
-    reading = Reading(ignore_masks=options.ignore_masks)
-    wanted = InputOptions(options.camera_info, options.projection, options.topic, options.every, reading=reading)
+    reading = Reading(options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind)
+    wanted = InputOptions(
+        options.camera_info,
+        options.projection,
+        options.topic,
+        options.every,
+        reading=reading,
+        camera_info_topic=options.camera_info_topic,
+    )
     recorded = RecordedInput(options.frames, wanted)
     recoverer = Recoverer(method=options.method)
     for _, frame in recorded:
         if isinstance(frame, FrameError):
             complain(str(frame))
             continue
-        if frame.warning:
-            complain(f"warning: {frame.name}: {frame.warning}")
+        for text in filter(None, (frame.warning, frame.notes)):
+            complain(f"{frame.name}: {text}")
         print(f"recovering {frame.name}", flush=True)
         settings = RecoveryOptions(method=options.method, free_space=frame.has_free_space)
         try:

@@ -29,12 +29,12 @@ from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry import rotation
 from sq_perception.imaging import unit_cube
-from sq_perception.nodes.frame import decode_by, listen_to_latched_info, newest, size_of, stamp_of
+from sq_perception.nodes.frame import decode_by, listen_to_latched_info, newest, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
-from sq_perception.recordings.bag_file import camera_info_topic
-from sq_perception.recordings.publication import drawn, superquadrics
+from sq_perception.recordings.bag_camera import camera_info_topic
+from sq_perception.recordings.publication import drawn, size_of, superquadrics
 from sq_perception.viewing import tables
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.page import Page

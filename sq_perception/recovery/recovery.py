@@ -123,9 +123,11 @@ class FrameRecovery:
     plane : (4,) or None
         Support plane, height above it = n.p + d.
     message
-        Why there are no objects, that some were left out, or that the depths are hardly metres; empty otherwise.
+        Why there are no objects, that some were left out, and ``doubt``; empty otherwise.
     reference
         What the next frame of the same camera is compared with.
+    doubt
+        Why the image seems to be in another unit or of another kind, and with it all bodies wrong; empty otherwise.
     """
 
     bodies: tuple[Recovery, ...]
@@ -134,6 +136,7 @@ class FrameRecovery:
     plane: np.ndarray | None
     message: str
     reference: Reference | None = None
+    doubt: str = ""
 
     @property
     def recovered(self) -> tuple[Recovery, ...]:

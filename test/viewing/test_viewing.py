@@ -19,7 +19,7 @@ from sq_perception.commands import view
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.recordings.bag_file import camera_info_topic
+from sq_perception.recordings.bag_camera import camera_info_topic
 from sq_perception.viewing import controls, drawings, tables
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.tables import NodeState
