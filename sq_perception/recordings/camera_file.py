@@ -244,7 +244,7 @@ def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None
         for name, value in node.items():
             words = [word.lower() for word in _WORDS.findall(str(name))]
             group = "depth" if "depth" in words else "colour" if any(word in _COLOUR for word in words) else ""
-            words = [word for word in words if word not in (*_OF_WHAT, *_COLOUR, "depth")]
+            words = [word for word in words if word.rstrip("0123456789") not in (*_OF_WHAT, *_COLOUR, "depth")]
             field = _NAMES.get(" ".join(words))
             field = _LENS if field == _COEFFICIENTS and isinstance(value, str) else field
             if field is not None and (field != _UNIT or group == "depth" or "map" in words):

@@ -258,6 +258,8 @@ def _read(
         return frame if labels is None else replace(frame, labels=labels)
     if suffix in cloud_file.SUFFIXES:
         return _read_cloud(path, reading)
+    if suffix == ".bag":
+        raise ValueError(f"a bag of ROS 1: convert it with: rosbags-convert --src {path} --dst {path.stem}")
     if suffix not in SUFFIXES:
         raise ValueError(f"expected a name that ends in {', '.join(SUFFIXES)}")
     image = _image(path)
