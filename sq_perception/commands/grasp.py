@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import add_ignore_masks, folder, parser, positive, text_target
+from sq_perception.commands.console import add_depth, add_ignore_masks, folder, parser, positive, text_target
 
 HELP = """\
 Plan grasps of a parallel gripper on the objects of recorded depth images.
@@ -37,6 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--friction", type=positive, help="between pads and things at the least (default 0.5)")
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
     add("--topic", metavar="TOPIC", help="the depth topic of a bag that has several")
+    add_depth(command)
     add_ignore_masks(command)
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")

@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        reading = Reading(ignore_masks=options.ignore_masks)
+        reading = Reading(options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind)
         recorded = RecordedInput(
             options.frames, InputOptions(options.camera_info, topic=options.topic, reading=reading)
         )
@@ -88,8 +88,8 @@ def _plan_all(
             if frame.is_cube:
                 code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
                 continue
-            if frame.warning:
-                complain(f"warning: {frame.name}: {frame.warning}")
+            for text in filter(None, (frame.warning, frame.notes)):
+                complain(f"{file}: {text}")
             stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
             try:
                 bodies = _bodies(stem, frame, recoverer, hand, friction, options)

@@ -110,12 +110,6 @@ def main(arguments: Sequence[str]) -> int:
     add("--jsonl", type=text_target, metavar="OUT", help="a line for each frame; those it has are skipped, see below")
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
     add("--html", type=target, metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
-    add(
-        "--depth-scale",
-        type=float,
-        metavar="N",
-        help="units a metre (1000 of whole numbers, 5000 of TUM RGB-D, 1 of floats)",
-    )
     add("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
     add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
     add(
