@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from sq_perception.files import output_file
 
@@ -34,9 +34,8 @@ class _Complaints(logging.Handler):
 
 
 def show_log() -> None:
-    """Print the package's warnings from now on, and that it has to compile, which takes minutes."""
+    """Print the package's warnings from now on."""
     log = logging.getLogger("sq_perception")
-    log.getChild("geometry.kernel_cache").setLevel(logging.INFO)
     if not log.handlers:
         log.addHandler(_Complaints())
 
@@ -58,9 +57,16 @@ def misused(message: str) -> int:
     return USAGE
 
 
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without twenty lines of usage before it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE, f"{self.prog}: {message}; {self.prog} --help shows all options\n")
+
+
 def parser(command: str, description: str, epilog: str | None = None) -> argparse.ArgumentParser:
     """The parser of one command, whose texts keep their lines."""
-    return argparse.ArgumentParser(
+    return Parser(
         prog=f"sq-perception {command}",
         description=description,
         epilog=epilog,

@@ -14,12 +14,12 @@ A FRAME is what 'sq-perception recover' reads: an .npz with depth and K, a PNG w
 EPILOG = """\
 output:
   {"format": "sq_perception.grasps", "version": 1, "options": {...},
-   "frames": [{"file": ..., "stamp": {"sec": ..., "nanosec": ...}, "bodies": [{"label": ..., "reason": ...,
+   "frames": [{"file": ..., "stamp": {"sec": ..., "nanosec": ...}, "bodies": [{"body": ..., "label": ..., "reason": ...,
    "grasps": [{"position": [x, y, z], "rotation": [x, y, z, w], "opening": ..., "width": ..., "score": ...,
    "weakest": ...}, ...]}, ...]}, ...]}
   Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z the approach, y the
   way of the fingers.  "score" is the probability that the grasp holds, the best first; "weakest" what takes most from
-  it.  A body without a grasp has the reason; those that could not be recovered come last.  The stamp is null where a
+  it.  Bodies are numbered as `recover` numbers them; one without a grasp has the reason.  The stamp is null where a
   frame has none.
 
 examples:

@@ -42,6 +42,15 @@ def run(repository: Path, page: str, given: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
+def test_the_reference(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = run(repository, "api.md", {})
+    assert "IoU 0.84" in capsys.readouterr().out
+    np.testing.assert_allclose(given["can"].gauge(given["points"]), 1, atol=1e-9)
+    assert given["surface"].volume == pytest.approx(float(given["can"].volume()), rel=0.02)
+    assert (tmp_path / "cans.stl").stat().st_size > 1000
+
+
 def test_the_surface_fit(repository: Path) -> None:
     found = run(repository, "surface_fit.md", names())["found"]
     np.testing.assert_allclose(found.superquadric.translation, BODY.translation, atol=0.03)
