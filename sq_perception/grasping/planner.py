@@ -54,7 +54,7 @@ from sq_perception.grasping.trials import (
     TABLE_SIGMA,
     Trials,
     log_phi,
-    passing,
+    log_passing,
     weight,
 )
 from sq_perception.imaging.camera import Camera
@@ -189,7 +189,7 @@ def _trials(
     deep = np.hypot(ways.near_sigma, placement)
     room = 0.5 * ways.opening - ways.reach
     logs = np.zeros((len(owner), len(MARGINS)))
-    sides = np.stack([passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
+    sides = np.stack([log_passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
     logs[:, 0] = sides[:, 0] + sides[:, 1]
     logs[:, 1] = log_phi(u + gripper.tip + ways.near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - ways.near - u, deep)
@@ -212,7 +212,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
     for end, way in ((0, 1), (1, -1)):
         reach, sigma = bodies.reaches(owner, way * y)
         gap = 0.5 * trials.opening[rows] - np.fmin(reached[:, end], reach - way * aside)
-        trials.sides[rows, end] = passing(gap, sigma, placement)
+        trials.sides[rows, end] = log_passing(gap, sigma, placement)
     trials.logs[rows, 0] = trials.sides[rows].sum(axis=1)
     return trials
 
@@ -231,7 +231,7 @@ def _among_others(
     gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns)
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
-    trials.logs[near, 6] = passing(gap[near], sigma, placement)
+    trials.logs[near, 6] = log_passing(gap[near], sigma, placement)
     trials = trials.first(_CHECKED_CLOSELY)
     boxes = gripper.boxes_at(trials.opening)
     gap = clearance.gaps_to_points(trials.frames, boxes, around.points)

@@ -79,7 +79,7 @@ def _rank(owner: np.ndarray) -> np.ndarray:
     return np.asarray(np.arange(len(owner)) - np.searchsorted(owner, owner))
 
 
-def passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
+def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
     """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
     return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
 
