@@ -71,12 +71,10 @@ _SQUARE = np.deg2rad(8.0)
 """Standard deviation of normals, radians."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
-_CLEAR = 0.95
-"""Probability of passing a body where it is widest, from which on a grasp need not be looked at more closely."""
-_CHECKED, _CHECKED_CLOSELY = 40, 16
-"""Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
-_CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
-"""Grasps looked at of a body whose best one, after the first ones, is less probable than the second number."""
+_CHECKED, _CHECKED_CLOSELY = 200, 16
+"""Grasps a body whose distance to the other bodies is computed, and of the best of these that to measured points."""
+_SURE = 0.5
+"""Probability of a body's best grasp below which its rims are tried as well."""
 _LEAST = 0.05
 """Probability below which grasps are not returned."""
 
@@ -127,15 +125,14 @@ def grasps(
     trials = _trials(known, bodies.volume(), closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
     reasons[_behind(known, around.plane)] = "behind the plane that bodies stand on"
-    trials = _narrower(known, trials.first(_CHECKED_IF_DOUBTFUL), gripper, placement)
-    trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
-    looked_at = _among_others(known, trials.first(_CHECKED), gripper, around, placement)
-    doubtful = np.setdiff1d(np.arange(len(bodies)), looked_at.owner[looked_at.total > np.log(_SURE)])
+    trials = _narrower(known, trials.first(_CHECKED), gripper, placement)
+    trials = _probable(trials, _CHECKED, reasons, "nothing holds")
+    trials = _among_others(known, trials, gripper, around, placement)
+    doubtful = np.setdiff1d(np.arange(len(bodies)), trials.owner[trials.total > np.log(_SURE)])
     if len(doubtful):
-        more = trials.at(np.isin(trials.owner, doubtful)).after(_CHECKED)
-        more = more.and_(at_rims(bodies, doubtful, gripper, around, friction, placement))
-        looked_at = looked_at.and_(_among_others(known, more, gripper, around, placement))
-    trials = _probable(looked_at, PER_BODY, reasons, "in the way")
+        rims = at_rims(bodies, doubtful, gripper, around, friction, placement)
+        trials = trials.join(_among_others(known, rims, gripper, around, placement))
+    trials = _probable(trials, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
 
@@ -204,7 +201,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
     """The trials with better margins where fingers end above the middle and so above where a body is widest."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
     beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
-    rows = np.flatnonzero((trials.logs[:, 0] < np.log(_CLEAR)) & ((beside * z).sum(axis=1) < 0))
+    rows = np.flatnonzero((beside * z).sum(axis=1) < 0)
     owner, y, beside = trials.owner[rows], y[rows], beside[rows]
     across = 0.5 * gripper.finger_width * trials.frames[rows, :, 0]
     reached = np.fmax.reduce([bodies.chords(owner, beside + k * across, y)[0] for k in (-1, 0, 1)])
