@@ -53,8 +53,8 @@ from sq_perception.grasping.trials import (
     SIDE_SIGMA,
     TABLE_SIGMA,
     Trials,
-    log_phi,
     log_passing,
+    log_phi,
     weight,
 )
 from sq_perception.imaging.camera import Camera
@@ -186,7 +186,8 @@ def _trials(
     deep = np.hypot(ways.near_sigma, placement)
     room = 0.5 * ways.opening - ways.reach
     logs = np.zeros((len(owner), len(MARGINS)))
-    sides = np.stack([log_passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
+    passes = [log_passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))]
+    sides = np.stack(passes, axis=1)
     logs[:, 0] = sides[:, 0] + sides[:, 1]
     logs[:, 1] = log_phi(u + gripper.tip + ways.near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - ways.near - u, deep)
