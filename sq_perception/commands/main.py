@@ -23,7 +23,7 @@ COMMANDS = {
     "recover": ("recover:main", "depth images in, superquadrics out"),
     "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
     "render": ("render:main", "draw a superquadric as a depth image"),
-    "demo": ("demo:main", "live demonstration with real ROS 2 nodes (extra 'ros')"),
+    "demo": ("demo:main", "a simulated camera and real ROS 2 nodes (extra 'ros')"),
     "train": ("train:main", "train a network"),
     "thing-views": ("shards:thing_views", "draw views of household things to train on"),
     "train-things": ("shards:train_things", "train the network that predicts the unseen side of things"),

@@ -116,7 +116,8 @@ def _extent(state: np.ndarray, x: float, y: float, z: float) -> float:
     # R^T n = n + 2 v x (v x n - w n) for the quaternion (v, w).
     dx, dy, dz = b * z - c * y - w * x, c * x - a * z - w * y, a * y - b * x - w * z
     x, y, z = x + 2.0 * (b * dz - c * dy), y + 2.0 * (c * dx - a * dz), z + 2.0 * (a * dy - b * dx)
-    return float(support(x, y, z, state[0], state[1], state[2], state[3], state[4]))
+    form = state[0], state[1], state[2], state[3], state[4], 0.0, 0.0
+    return float(support(x, y, z, *form))
 
 
 def _assign(

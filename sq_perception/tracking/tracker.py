@@ -179,7 +179,7 @@ def _in_world(
             raise ValueError("recoveries: expected a single body in each")
         if np.shape(body.covariance) != (LENGTH, LENGTH):
             raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(body.covariance)}")
-    flat = np.array([body.superquadric.to_flat() for body in recoveries], dtype=float).reshape(-1, 12)
+    flat = np.array([body.superquadric.untapered().to_flat() for body in recoveries], dtype=float).reshape(-1, 12)
     covariance = np.array([body.covariance for body in recoveries], dtype=float).reshape(-1, LENGTH, LENGTH)
     size, shape, centre, turn = UNKNOWN
     for k in np.flatnonzero(~np.isfinite(covariance).all(axis=(1, 2))):

@@ -529,6 +529,18 @@ def test_what_is_left_out_of_a_frame_is_said(bench):
     bench.until(lambda: [entry for entry in log if "more objects than max_objects = 1" in entry.msg])
 
 
+def test_images_without_a_frame_are_answered_and_one_warning_says_what_that_means(bench):
+    log = bench.hear(Log, "/rosout", 50)
+    for _ in range(3):
+        image = bench.depth()
+        image.header.frame_id = ""
+        assert bench.answer(image)[0].header.frame_id == ""
+    bench.until(lambda: [entry for entry in log if "the images have no frame_id" in entry.msg])
+    bench.node.get_logger().info("the last line")
+    bench.until(lambda: log[-1].msg == "the last line")
+    assert sum("no frame_id" in entry.msg for entry in log) == 1
+
+
 def test_silence_is_reported(make_bench):
     bench = make_bench("-p", "no_frame_warning:=0.5")
     reports = bench.hear(DiagnosticArray, "/diagnostics")

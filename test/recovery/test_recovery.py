@@ -456,7 +456,7 @@ def test_misuse_is_refused(symmetry):
         symmetry.recover(np.ones((240, 320)), CAMERA, np.ones((240, 320)))
     with pytest.raises(ValueError, match="method"):
         Recoverer(method="magic")
-    with pytest.raises(ValueError, match="device"):
+    with pytest.raises(ValueError, match="device: expected cpu, cuda or cuda:N, got"):
         Recoverer(method="symmetry", device="abacus")
     with pytest.raises(TypeError, match="model: expected a file of weights or its name, got RecoveryOptions"):
         Recoverer(RecoveryOptions())
