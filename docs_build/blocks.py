@@ -183,6 +183,15 @@ def tracks() -> str:
     return table(f"camera, masks | {after} | common to all views | {SIGMAS}", rows)
 
 
+def cameras() -> str:
+    """What a second camera tells of household things."""
+    rows = []
+    for name, row in results("two_cameras")["rows"].items():
+        edges = f"{1e3 * row['edge']:.1f} / {1e3 * row['median_edge']:.1f}"
+        rows.append(f"{name} | {100 * row['weak']:.0f} | {edges} | {100 * row['iou']:.1f} | {100 * row['covered']:.0f}")
+    return table(f"masks, cameras | weak % | edge error mm, mean / median | IoU % | {SIGMAS}", rows)
+
+
 # The packages
 
 
@@ -373,6 +382,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         picking_gains,
         picking_scores,
         tracks,
+        cameras,
         layers,
         packages,
     )

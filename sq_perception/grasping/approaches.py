@@ -26,12 +26,10 @@ _TOO_WIDE = 0.8
 """Sigmas of a body's width by which it may exceed the opening and is tried still: beyond, it would fit once in five."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
 """Turns of the approach about the closing line, away from the steepest one."""
-_STEEP, _FROM_BELOW = 0.3, -0.1
-"""Sines of the least angle of a closing line to the vertical, and of how steeply down a hand comes at least."""
+_STEEP = 0.3
+"""Sine of the least angle of a closing line to the vertical."""
 _SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
 """Slides along the third axis, as shares of the way to where the finger's width is no longer wholly on the body."""
-_SAME = 1e-3
-"""Slide, metres, below which it counts as the one in the middle."""
 _ABOVE_TABLE = 0.004
 """Height above the table that a gripper keeps at its deepest, metres."""
 _ENGAGED = 0.012
@@ -138,7 +136,7 @@ def from_every_side(
     steep = steep / np.maximum(length, 1e-9)
     swing = np.tile(_SWINGS, len(found.owner))[:, None]
     z = np.cos(swing) * steep + np.sin(swing) * np.cross(y, steep)
-    possible = (length[:, 0] > _STEEP) & ((z * down).sum(axis=1) > _FROM_BELOW)
+    possible = (length[:, 0] > _STEEP) & ((z * down).sum(axis=1) > 0)
     owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
     x, tilting = np.cross(y, z), np.cross(down[possible], y)
     near, near_sigma = bodies.reaches(owner, -z)
@@ -174,7 +172,7 @@ def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: f
     u = np.repeat(depth, len(_SLIDES), axis=1).ravel()
     v = np.tile(slide, (1, depth.shape[1])).ravel()
     of = np.repeat(rows, count)
-    distinct = (np.abs(v) > _SAME) | (np.tile(np.arange(count) % len(_SLIDES), len(rows)) == 0)
+    distinct = (v != 0) | (np.tile(np.arange(count) % len(_SLIDES), len(rows)) == 0)
     u, v, of = u[distinct], v[distinct], of[distinct]
 
     # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.

@@ -53,8 +53,8 @@ from sq_perception.grasping.trials import (
     SIDE_SIGMA,
     TABLE_SIGMA,
     Trials,
+    log_passing,
     log_phi,
-    passing,
     weight,
 )
 from sq_perception.imaging.camera import Camera
@@ -71,12 +71,10 @@ _SQUARE = np.deg2rad(8.0)
 """Standard deviation of normals, radians."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
-_CLEAR = 0.95
-"""Probability of passing a body where it is widest, from which on a grasp need not be looked at more closely."""
-_CHECKED, _CHECKED_CLOSELY = 40, 16
-"""Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
-_CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
-"""Grasps looked at of a body whose best one, after the first ones, is less probable than the second number."""
+_CHECKED, _CHECKED_CLOSELY = 200, 16
+"""Grasps a body whose distance to the other bodies is computed, and of the best of these that to measured points."""
+_SURE = 0.5
+"""Probability of a body's best grasp below which its rims are tried as well."""
 _LEAST = 0.05
 """Probability below which grasps are not returned."""
 
@@ -127,15 +125,14 @@ def grasps(
     trials = _trials(known, bodies.volume(), closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
     reasons[_behind(known, around.plane)] = "behind the plane that bodies stand on"
-    trials = _narrower(known, trials.first(_CHECKED_IF_DOUBTFUL), gripper, placement)
-    trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
-    looked_at = _among_others(known, trials.first(_CHECKED), gripper, around, placement)
-    doubtful = np.setdiff1d(np.arange(len(bodies)), looked_at.owner[looked_at.total > np.log(_SURE)])
+    trials = _narrower(known, trials.first(_CHECKED), gripper, placement)
+    trials = _probable(trials, _CHECKED, reasons, "nothing holds")
+    trials = _among_others(known, trials, gripper, around, placement)
+    doubtful = np.setdiff1d(np.arange(len(bodies)), trials.owner[trials.total > np.log(_SURE)])
     if len(doubtful):
-        more = trials.at(np.isin(trials.owner, doubtful)).after(_CHECKED)
-        more = more.and_(at_rims(bodies, doubtful, gripper, around, friction, placement))
-        looked_at = looked_at.and_(_among_others(known, more, gripper, around, placement))
-    trials = _probable(looked_at, PER_BODY, reasons, "in the way")
+        rims = at_rims(bodies, doubtful, gripper, around, friction, placement)
+        trials = trials.join(_among_others(known, rims, gripper, around, placement))
+    trials = _probable(trials, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
 
@@ -189,7 +186,8 @@ def _trials(
     deep = np.hypot(ways.near_sigma, placement)
     room = 0.5 * ways.opening - ways.reach
     logs = np.zeros((len(owner), len(MARGINS)))
-    sides = np.stack([passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
+    passes = [log_passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))]
+    sides = np.stack(passes, axis=1)
     logs[:, 0] = sides[:, 0] + sides[:, 1]
     logs[:, 1] = log_phi(u + gripper.tip + ways.near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - ways.near - u, deep)
@@ -204,7 +202,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
     """The trials with better margins where fingers end above the middle and so above where a body is widest."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
     beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
-    rows = np.flatnonzero((trials.logs[:, 0] < np.log(_CLEAR)) & ((beside * z).sum(axis=1) < 0))
+    rows = np.flatnonzero((beside * z).sum(axis=1) < 0)
     owner, y, beside = trials.owner[rows], y[rows], beside[rows]
     across = 0.5 * gripper.finger_width * trials.frames[rows, :, 0]
     reached = np.fmax.reduce([bodies.chords(owner, beside + k * across, y)[0] for k in (-1, 0, 1)])
@@ -212,7 +210,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
     for end, way in ((0, 1), (1, -1)):
         reach, sigma = bodies.reaches(owner, way * y)
         gap = 0.5 * trials.opening[rows] - np.fmin(reached[:, end], reach - way * aside)
-        trials.sides[rows, end] = passing(gap, sigma, placement)
+        trials.sides[rows, end] = log_passing(gap, sigma, placement)
     trials.logs[rows, 0] = trials.sides[rows].sum(axis=1)
     return trials
 
@@ -231,7 +229,7 @@ def _among_others(
     gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns)
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
-    trials.logs[near, 6] = passing(gap[near], sigma, placement)
+    trials.logs[near, 6] = log_passing(gap[near], sigma, placement)
     trials = trials.first(_CHECKED_CLOSELY)
     boxes = gripper.boxes_at(trials.opening)
     gap = clearance.gaps_to_points(trials.frames, boxes, around.points)

@@ -27,8 +27,8 @@ NEARER = 0.4
 to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where
 they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
-_GRAVITY, _LIFT = 9.81, 2.0
-"""Accelerations of gravity and of the lift beside it, m/s^2."""
+_ACCELERATION = 9.81 + 2.0
+"""Of gravity and of the lift beside it, m/s^2."""
 _PAD_RADIUS = 0.006
 """Mean arm of the friction of a pad of some 18 mm, metres."""
 
@@ -49,7 +49,7 @@ class Trials(NamedTuple):
     def at(self, which: np.ndarray) -> Trials:
         return Trials(*(part[which] for part in self))
 
-    def and_(self, other: Trials) -> Trials:
+    def join(self, other: Trials) -> Trials:
         return Trials(*map(np.concatenate, zip(self, other, strict=True)))
 
     @property
@@ -67,19 +67,13 @@ class Trials(NamedTuple):
         total = self.total
         rows = np.flatnonzero(total >= least)  # also what cannot hold, -inf: why it does not is a reason
         rows = rows[np.lexsort((-total[rows], self.owner[rows]))]
-        return self.at(rows[_rank(self.owner[rows]) < count])
-
-    def after(self, count: int) -> Trials:
-        """The trials but the ``count`` first ones of each body, of trials in the order of :meth:`first`."""
-        return self.at(np.flatnonzero(_rank(self.owner) >= count))
+        owner = self.owner[rows]
+        rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
+        return self.at(rows[rank < count])
 
 
-def _rank(owner: np.ndarray) -> np.ndarray:
-    """The rank, from 0, of each trial (k,) among those of its body; bodies are in order."""
-    return np.asarray(np.arange(len(owner)) - np.searchsorted(owner, owner))
 
-
-def passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
+def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
     """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
     return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
 
@@ -96,5 +90,5 @@ def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.nd
 
     As a force, and as a torque that the friction holds by its mean ``arm``.
     """
-    load = np.maximum(1 + _LIFT / _GRAVITY, lever / arm) * _GRAVITY * mass / force
+    load = np.maximum(1.0, lever / arm) * _ACCELERATION * mass / force
     return log_phi(1 / np.maximum(load, 1e-9) - 1, 0.5)

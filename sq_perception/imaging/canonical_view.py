@@ -191,7 +191,7 @@ def from_mask(
 
     matrix = _FLIP @ look
     unread = float(depth[mask & np.isfinite(depth)].mean()) if missing_is_hidden else np.nan
-    image, low, high, closest = _turned(depth, mask, unread, camera.lens, matrix)
+    image, low, high, closest = _rotate(depth, mask, unread, camera.lens, matrix)
     z = image[np.isfinite(image)]
     outliers = int(z.size * OUTLIERS_PER_END)
     ordered = np.partition(z, [outliers, z.size // 2, z.size - 1 - outliers])
@@ -209,7 +209,7 @@ def from_mask(
         ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
         nearer = _nearer(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
-    value, beside = _resampled(image, filled, nearer, beyond, camera.lens, matrix, anchor, extent, middle, pixels)
+    value, beside = _resample(image, filled, nearer, beyond, camera.lens, matrix, anchor, extent, middle, pixels)
     return CanonicalView(value, beside, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
 
 
@@ -293,7 +293,7 @@ def _within_hull(mask: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _turned(
+def _rotate(
     depth: np.ndarray,
     mask: np.ndarray,
     unread: float,
@@ -353,7 +353,7 @@ def _nearer(
 
 
 @kernel
-def _resampled(
+def _resample(
     image: np.ndarray,
     filled: np.ndarray,
     nearer: np.ndarray,

@@ -94,7 +94,7 @@ class Distortion:
         points = np.asarray(points, dtype=float)
         x, y = points[..., 0], points[..., 1]
         with np.errstate(all="ignore"):
-            image_x, image_y, (xx, xy, yy) = self._mapped(x, y)
+            image_x, image_y, (xx, xy, yy) = self._map(x, y)
             known = (np.hypot(x, y) <= self._table[0][-1]) & (xx * yy - xy * xy > 0) & (xx + yy > 0)
         return np.where(known[..., None], np.stack([image_x, image_y], axis=-1), np.nan)
 
@@ -110,7 +110,7 @@ class Distortion:
             start = np.where(radius > 0, np.interp(radius, reached, table) / radius, 1.0)
             x, y = flat[:, 0] * start, flat[:, 1] * start
             for _ in range(_STEPS):
-                image_x, image_y, (xx, xy, yy) = self._mapped(x, y)
+                image_x, image_y, (xx, xy, yy) = self._map(x, y)
                 miss_x, miss_y = flat[:, 0] - image_x, flat[:, 1] - image_y
                 # Relative: the farther out, the larger the numbers.
                 if not (np.abs(miss_x) + np.abs(miss_y) > _EXACT * (1 + radius)).any():
@@ -122,7 +122,7 @@ class Distortion:
             rays[~(wrong <= 100 * _EXACT * (1 + radius))] = np.nan
         return rays.reshape(images.shape)
 
-    def _mapped(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    def _map(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
         """Images (x', y'), and dx'/dx, dx'/dy = dy'/dx, dy'/dy."""
         s = x * x + y * y
         q, slope = self._radial(s)
