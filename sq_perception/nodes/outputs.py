@@ -15,6 +15,7 @@ fails; and what planners know outlives a restart after a fault, so that an objec
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Collection, Sequence
 from functools import partial
 from time import monotonic
@@ -22,6 +23,7 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind
@@ -190,8 +192,7 @@ class OptionalOutputs:
         self.absent: dict[str, str] = {}
         """Packages that are missing, by what asks for them; replaced as a whole, for other threads."""
         self._scene = collision_objects.Scene()
-        self._listeners: tuple[int, frozenset[bytes]] = 0, frozenset()
-        """How many planners there were, and which."""
+        self._planner_came = threading.Event()
         self._all_due = 0.0
 
     def follow(self, parameters: RecoverParameters) -> None:
@@ -225,9 +226,10 @@ class OptionalOutputs:
                 detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
             )
         heard = self._heard("publish_collision_objects")
-        if self._has_another_listener(heard):
-            self._scene.forget()
         if heard is not None:
+            if self._planner_came.is_set():
+                self._planner_came.clear()
+                self._scene.forget()
             self._publish_scene(heard, found, parameters, hidden)
 
     def _publish_scene(
@@ -268,7 +270,10 @@ class OptionalOutputs:
         package, kind, topic, queue = _KINDS[parameter]
         try:
             message_type: Any = installed(f"{package}/msg/{kind}")
-            self._publishers[parameter] = self._node.create_publisher(message_type, topic, queue)
+            events = PublisherEventCallbacks(matched=partial(self._note_listener, parameter))
+            self._publishers[parameter] = self._node.create_publisher(
+                message_type, topic, queue, event_callbacks=events
+            )
         except Exception as error:  # a package that is there in part fails in other ways than ImportError
             self.absent = {**self.absent, parameter: package}
             self._node.get_logger().warning(
@@ -276,19 +281,10 @@ class OptionalOutputs:
                 f"package ros-$ROS_DISTRO-{package.replace('_', '-')}"
             )
 
-    def _has_another_listener(self, heard: Publisher | None) -> bool:
-        """Whether there is a planner that was not there at the last frame.
-
-        Both their number and their identities are compared: the number does not show a planner that has started again
-        meanwhile, the identities do not show one that was known before it could be reached.
-        """
-        number, names = self._listeners
-        if heard is None:
-            self._listeners = 0, frozenset()
-            return False
-        those = self._node.get_subscriptions_info_by_topic(heard.topic_name)
-        self._listeners = heard.get_subscription_count(), frozenset(bytes(one.endpoint_gid) for one in those)
-        return self._listeners[0] > number or not self._listeners[1] <= names
+    def _note_listener(self, parameter: str, event: Any) -> None:
+        """A planner that has come, or has started again, knows nothing; called in the executor's thread."""
+        if parameter == "publish_collision_objects" and event.current_count_change > 0:
+            self._planner_came.set()
 
     def _heard(self, parameter: str) -> Publisher | None:
         """The publisher of what is asked for, if somebody listens."""

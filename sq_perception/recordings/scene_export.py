@@ -119,7 +119,7 @@ def write(
     frame: str = "world",
     meshes: bool = False,
 ) -> list[Path]:
-    """Write n bodies (n,) as a scene; the files, those of meshes behind the scene's.
+    """Write n bodies (n,) as a scene; the files, those of meshes behind the scene's.  ValueError as :func:`solids`.
 
     Parameters
     ----------
@@ -129,8 +129,6 @@ def write(
         The link of a URDF that the bodies are fixed to.
     meshes
         Close meshes instead of the smallest enclosing solids.
-
-    Raises ValueError as :func:`solids`, OSError where a file cannot be written.
     """
     import trimesh
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import types
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -70,10 +71,25 @@ def found(*ids: int, header: Header = HEADER) -> publication.Findings:
 class Publisher:
     """Notes what is published while ``listeners`` is above 0 or not."""
 
-    def __init__(self, kind: type[Any], topic: str, queue: int) -> None:
-        self.msg_type, self.topic, self.queue, self.listeners = kind, topic, queue, 1
-        self.topic_name, self.restarts = topic, 0
+    def __init__(self, kind: type[Any], topic: str, queue: int, matched: Callable[[Any], None]) -> None:
+        self.msg_type, self.topic, self.queue, self._matched = kind, topic, queue, matched
+        self.topic_name, self._listeners = topic, 0
+        self.listeners = 1
         self.sent: list[Any] = []
+
+    @property
+    def listeners(self) -> int:
+        return self._listeners
+
+    @listeners.setter
+    def listeners(self, count: int) -> None:
+        change, self._listeners = count - self._listeners, count
+        self._matched(SimpleNamespace(current_count_change=change))
+
+    def restart(self) -> None:
+        """A listener ends and comes back, between two frames."""
+        self.listeners -= 1
+        self.listeners += 1
 
     def get_subscription_count(self) -> int:
         return self.listeners
@@ -93,18 +109,14 @@ class Node:
         self.said: list[str] = []
         self.time = 100.0
 
-    def create_publisher(self, kind: type[Any], topic: str, queue: int) -> Publisher:
+    def create_publisher(self, kind: type[Any], topic: str, queue: int, event_callbacks: Any) -> Publisher:
         assert topic not in self.publishers
-        self.publishers[topic] = Publisher(kind, topic, queue)
+        self.publishers[topic] = Publisher(kind, topic, queue, event_callbacks.matched)
         self.all.append(self.publishers[topic])
         return self.publishers[topic]
 
     def destroy_publisher(self, publisher: Publisher) -> None:
         assert self.publishers.pop(publisher.topic) is publisher
-
-    def get_subscriptions_info_by_topic(self, topic: str) -> list[Any]:
-        publisher = self.publishers[topic]
-        return [SimpleNamespace(endpoint_gid=[publisher.restarts, k]) for k in range(publisher.listeners)]
 
     def get_logger(self) -> Any:
         def warning(text: str, once: bool = False, **_: Any) -> None:
@@ -243,7 +255,7 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     show(BOX, CAN, collision_shapes="mesh")
     scene.listeners = 1
     assert show(BOX, CAN, collision_shapes="mesh") == 2, "a planner that has started again knows nothing"
-    scene.restarts += 1
+    scene.restart()
     assert show(BOX, CAN, collision_shapes="mesh") == 2, "between two frames, too"
     assert show(BOX, CAN, collision_shapes="mesh") == 0
 
@@ -255,7 +267,7 @@ def test_a_new_planner_is_told_of_what_an_arm_hides(node):
     scene = node.publishers[SCENE]
     outputs.publish(found(1, 2), ALL)
     (_, before) = scene.sent[-1].world.collision_objects
-    scene.restarts = 1
+    scene.restart()
     outputs.publish(found(1), ALL, hidden=(2, 7))
     (_, again) = scene.sent[-1].world.collision_objects
     assert again == before, "as it was last seen"
@@ -267,13 +279,13 @@ def test_a_new_planner_is_told_of_what_an_arm_hides(node):
     outputs.publish(found(1, 2), ALL)
     assert list(objects(scene)) == ["superquadric_2"], "shown again"
 
-    scene.restarts = 2
+    scene.restart()
     outputs.publish(found(1), replace(ALL, fixed_frame="map"), hidden=(2,))
     assert list(objects(scene)) == ["superquadric_1"]
-    scene.restarts = 3
+    scene.restart()
     outputs.publish(found(1), replace(ALL, fixed_frame="map", target_frame="base_link"), hidden=(2,))
     assert list(objects(scene)) == ["superquadric_1", "superquadric_2"]
-    scene.restarts = 4
+    scene.restart()
     outputs.publish(found(1, header=Header(frame_id="other")), ALL, hidden=(2,))
     assert list(objects(scene)) == ["superquadric_1"], "planners that know it know it in its own frame"
 
