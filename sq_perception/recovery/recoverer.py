@@ -35,7 +35,7 @@ from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_blas_thread, short_turns
-from sq_perception.imaging import depth_units, perforation, raycast
+from sq_perception.imaging import depth_units, perforation, ranges, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
@@ -249,7 +249,7 @@ class Recoverer:
             reference = continuity.mixed(reference, previous.reference, found.labels, kept_labels)
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
-        doubt = depth_units.wrong_unit(measured) if camera.is_pinhole else ""
+        doubt = _doubt(measured, camera)
         message = "; ".join(filter(None, (message, doubt)))
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference, doubt)
 
@@ -360,6 +360,13 @@ def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, f
         return depth
     out = (labels > 0) & ((depth < near) | (depth > far))
     return np.where(out, np.float32(np.nan), depth)
+
+
+def _doubt(depth: np.ndarray, camera: Camera) -> str:
+    """What makes all of an image's bodies doubtful; empty otherwise."""
+    if not camera.is_pinhole:
+        return ""
+    return depth_units.wrong_unit(depth) or (ranges.RANGES if ranges.seem_ranges(depth, camera) else "")
 
 
 def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
