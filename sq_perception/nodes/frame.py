@@ -102,7 +102,11 @@ def decode(
         Units a metre, None: by the encoding; and whether the image holds "z" or "range".
     """
     if isinstance(message, PointCloud2):
-        depth, seen, is_image = cloud_file.as_image(points_from_message(message) / np.float32(scale or 1.0))
+        points = points_from_message(message) / np.float32(scale or 1.0)
+        try:
+            depth, seen, is_image = cloud_file.as_image(points)
+        except ValueError as error:
+            raise ValueError(f"points in {message.header.frame_id or 'a frame without a name'}: {error}") from error
         numbers = {name: round(getattr(seen, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
         calibration = Calibration(replace(seen, **numbers))
         return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)

@@ -40,6 +40,8 @@ _LARGEST_SIDE = 1024
 _WIDEST = 1.75
 """|x / z| and |y / z| of points: 60 degrees off the axis, the edge of the widest images of depth cameras.  Clouds of
 several views have some below or beside the camera, and one of them is enough to leave no pixels for all others."""
+_MOST_UNSEEN = 1 / 3
+"""Share of the points that are behind the camera or off its axis; more are those of another frame."""
 _NEIGHBOURS = 2000
 """Points whose nearest neighbour gives the density of the cloud."""
 
@@ -74,10 +76,18 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     with np.errstate(invalid="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
         before = there & (points[..., 2] > LEAST_DEPTH) & (points[..., 2] < GREATEST_DEPTH)
-    expected = f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
-    if np.count_nonzero(there & (points[..., 2] < 0)) > 0.5 * np.count_nonzero(there):
+    count = np.count_nonzero(there)
+    with np.errstate(all="ignore"):
+        near = before & (np.abs(points[..., :2]).max(axis=2) < _WIDEST * points[..., 2])
+    behind, off = (float(np.count_nonzero(some)) / max(count, 1) for some in (there & ~before, before & ~near))
+    expected = (
+        f"expected {_LEAST_POINTS} points or more, most of them before the camera: x right, y down, z forward from it; "
+        f"of {count} points {behind:.0%} are behind it and {off:.0%} more than 60 degrees off its axis. A cloud in the "
+        "frame of a robot, a table or a map (z up) has to be transformed into the camera's optical frame"
+    )
+    if behind > 0.5:
         expected += " (of clouds with z backward, as graphics has it, negate z, and y where it is up)"
-    if np.count_nonzero(before) < max(_LEAST_POINTS, 0.5 * np.count_nonzero(there)):
+    if np.count_nonzero(before) < _LEAST_POINTS or behind > 0.5:
         raise UnpackingError(expected)
     if points.shape[0] > 1:
         v, u = (index[:: 1 + np.count_nonzero(before) // _FITTED] for index in np.nonzero(before))
@@ -88,12 +98,10 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
         if min(fx, fy) > 0 and np.count_nonzero(off < _PIXEL_ERROR) > _ON_PIXELS * off.size:
             depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
             return depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), True
-    x, y, z = points[before].astype(float).T
-    tangents = np.stack([x / z, y / z], axis=1)
-    near = np.abs(tangents).max(axis=1) < _WIDEST
-    if np.count_nonzero(near) < _LEAST_POINTS:
+    if np.count_nonzero(near) < max(_LEAST_POINTS, (1 - _MOST_UNSEEN) * count):
         raise UnpackingError(expected)
-    return (*_seen(tangents[near], z[near]), False)
+    x, y, z = points[near].astype(float).T
+    return (*_seen(np.stack([x / z, y / z], axis=1), z), False)
 
 
 def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:

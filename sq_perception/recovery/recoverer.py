@@ -38,7 +38,7 @@ from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_blas_thread, short_turns
-from sq_perception.imaging import depth_units, perforation, raycast
+from sq_perception.imaging import depth_units, perforation, ranges, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
@@ -289,7 +289,7 @@ class Recoverer:
         }
         segmentation = found.segmentation
         message = _left_out(segmentation, options) if bodies else _why_empty(depth, segmentation, readings.labels)
-        doubt = depth_units.wrong_unit(readings.depth) if camera.is_pinhole else ""
+        doubt = _doubt(readings.depth, camera)
         message = "; ".join(filter(None, (message, doubt)))
         return FrameRecovery(bodies, milliseconds, segmentation.labels, segmentation.plane, message, doubt)
 
@@ -407,6 +407,13 @@ def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, f
         return depth
     out = (labels > 0) & ((depth < near) | (depth > far))
     return np.where(out, np.float32(np.nan), depth)
+
+
+def _doubt(depth: np.ndarray, camera: Camera) -> str:
+    """What makes all of an image's bodies doubtful; empty otherwise."""
+    if not camera.is_pinhole:
+        return ""
+    return depth_units.wrong_unit(depth) or (ranges.RANGES if ranges.seem_ranges(depth, camera) else "")
 
 
 def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:

@@ -170,6 +170,16 @@ def test_what_is_no_cloud_is_refused(tmp_path, content, said):
         read(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize("origin", [(0, 0, 0), (0.5, 0, 0), (0.5, 0, -0.05)])
+def test_a_cloud_in_the_frame_of_a_table_or_robot_is_refused_with_what_is_not_seen(tmp_path, rng, origin):
+    """z up, the origin on the table, beside it or a little below: most points are beside the axis of a camera there."""
+    table = np.concatenate([rng.uniform(-0.5, 0.5, (4000, 2)), 0.002 * rng.standard_normal((4000, 1))], axis=1)
+    box = rng.uniform([-0.05, -0.03, 0.0], [0.05, 0.03, 0.16], (800, 3))
+    trimesh.PointCloud(np.concatenate([table, box]) - origin).export(tmp_path / "a.ply")
+    with pytest.raises(FrameError, match=r"of 4800 points \d+% are behind it and \d+% more than 60 .*z up"):
+        read(tmp_path / "a.ply")
+
+
 def test_a_cloud_behind_the_camera_is_named(tmp_path):
     _, cloud = points()
     with pytest.raises(FrameError, match="z forward"):

@@ -1,0 +1,77 @@
+"""Whether an image holds distances to the camera's centre in place of z: its planes then bend like spheres around it.
+
+With r the ray (x, y, 1) of a pixel and a plane n.p + d = 0, the number v of its pixels is, for a and k,
+
+    1/v = a.r / |r|^k            k = 0: z,   k = 1: range,   a = -n / d
+
+linear in a for each k.  The plane with most readings is sought for both; ranges are those where k = 1 has clearly more of
+them and k, fitted to them, is 1.  A table that really bends by 1 or 2 % of its length has k = 0.3 at the most: where a
+support spans so little of the image that less would do, nothing is said.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+
+RANGES = (
+    "the support bends as if the image held distances to the camera's centre in place of z: --depth-kind range of "
+    "commands, depth_kind of nodes"
+)
+_POINTS, _COUNTED, _DRAWS = 2500, 600, 150
+"""About so many readings are looked at, so many of them count for a drawn plane, and so many planes are drawn."""
+_TOLERANCE = 0.006
+"""Of a plane, as a share of the distance."""
+_SHARE, _MORE = 0.25, 1.2
+"""Of the readings on the plane of ranges, and the ratio to those on the plane of z."""
+_LEVER = 0.01
+"""Root mean square of log |r| on the plane, beside what a tilt explains."""
+_LEAST_K, _GREATEST_K = 0.75, 1.25
+
+
+def seem_ranges(depth: np.ndarray, camera: Camera) -> bool:
+    """Whether an image (height, width), NaN where nothing was measured, seems to hold ranges."""
+    step = max(1, math.isqrt(depth.size // _POINTS))
+    v, u = np.nonzero(np.isfinite(depth[::step, ::step]))
+    if not camera.is_pinhole or v.size < 100:
+        return False
+    number = depth[::step, ::step][v, u].astype(float)
+    rays = np.stack([(step * u - camera.cx) / camera.fx, (step * v - camera.cy) / camera.fy, np.ones(u.size)], axis=1)
+    length = np.linalg.norm(rays, axis=1)
+    bend = np.log(length)
+    if bend.std() < _LEVER:  # of the whole image, the plane's is less
+        return False
+    as_z, as_range = _on_plane(rays, number), _on_plane(rays, number / length)
+    count = np.count_nonzero(as_range)
+    if count < _SHARE * number.size or count < _MORE * np.count_nonzero(as_z):
+        return False
+    # log v = k log |r| - log a.r, linearised at the plane of ranges: a shift of k against shifts of a.
+    rays, number, bend, length = rays[as_range], number[as_range], bend[as_range], length[as_range]
+    plane = np.linalg.lstsq(rays, length / number, rcond=None)[0]
+    tilts = rays / (rays @ plane)[:, None]
+    across = bend - tilts @ np.linalg.lstsq(tilts, bend, rcond=None)[0]
+    left = np.log(number * (rays @ plane) / length)
+    k = 1 + across @ left / (across @ across)
+    return bool(np.sqrt(np.mean(across**2)) > _LEVER and _LEAST_K < k < _GREATEST_K)
+
+
+def _on_plane(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Which of the points z * rays lie on the plane that has most of them."""
+    rng = np.random.default_rng(0)
+    some = rng.permutation(z.size)[:_COUNTED]
+    drawn = rng.integers(z.size, size=(_DRAWS, 3))
+    drawn = drawn[np.abs(np.linalg.det(rays[drawn])) > 1e-4]
+    if not len(drawn):
+        return np.zeros(z.size, bool)
+    planes = np.linalg.solve(rays[drawn], 1 / z[drawn][..., None])[..., 0]
+    counts = np.count_nonzero(np.abs(planes @ rays[some].T * z[some] - 1) < _TOLERANCE, axis=1)
+    plane = planes[counts.argmax()]
+    for _ in range(4):
+        on = np.abs(rays @ plane * z - 1) < _TOLERANCE
+        if np.count_nonzero(on) < 3:
+            break
+        plane = np.linalg.lstsq(rays[on] * z[on, None], np.ones(np.count_nonzero(on)), rcond=None)[0]
+    return np.abs(rays @ plane * z - 1) < _TOLERANCE
