@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from sq_perception.imaging.camera import Camera
     from sq_perception.imaging.raycast import render
     from sq_perception.recordings.frame_file import RecordedFrame
-    from sq_perception.recordings.frame_file import read as read_frame
+    from sq_perception.recordings.single_frame import read_frame
     from sq_perception.recovery.crops import recover_crops
     from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
@@ -64,7 +64,7 @@ _HOMES = {
     "fit": "fitting.surface_fit",
     "iou": "geometry.metrics:volume_iou",
     "mesh": "geometry.mesh",
-    "read_frame": "recordings.frame_file:read",
+    "read_frame": "recordings.single_frame",
     "recover_crops": "recovery.crops",
     "recovery_figure": "evaluation.recovery_figure",
     "render": "imaging.raycast",

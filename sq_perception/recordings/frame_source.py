@@ -18,6 +18,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.recordings import bag_file, frame_file, inputs
 from sq_perception.recordings.frame_file import RecordedFrame
+from sq_perception.recordings.single_frame import read_frame
 from sq_perception.simulation.scenes import TABLE_CAMERA, table_scene, thesis_scene
 from sq_perception.simulation.sensor_noise import IDEAL, Ideal, preset
 
@@ -115,7 +116,7 @@ def recorded(
 
     def make(position: int) -> SourceFrame:
         path = paths[position]
-        frame = frame_file.read(path, camera_info or inputs.camera_beside(path), projection)
+        frame = read_frame(path, camera_info, projection)
         labels = frame.labels if with_labels else None
         return SourceFrame(frame.depth, frame.camera, labels, frame.name)
 
