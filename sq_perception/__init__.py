@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sq_perception.imaging.raycast import render
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.frame_file import read as read_frame
+    from sq_perception.recovery.crops import recover_crops
     from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
 __all__ = [
@@ -42,6 +43,7 @@ __all__ = [
     "iou",
     "mesh",
     "read_frame",
+    "recover_crops",
     "recovery_figure",
     "render",
     "sample",
@@ -63,6 +65,7 @@ _HOMES = {
     "iou": "geometry.metrics:volume_iou",
     "mesh": "geometry.mesh",
     "read_frame": "recordings.frame_file:read",
+    "recover_crops": "recovery.crops",
     "recovery_figure": "evaluation.recovery_figure",
     "render": "imaging.raycast",
     "sample": "geometry.mesh",

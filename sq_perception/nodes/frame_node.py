@@ -273,12 +273,13 @@ class FrameNode(ManagedNode):
         if abs(age) < OLDEST:
             stages["stamp to result"] = 1e3 * age
         self._outputs.accompany(found, shown, frame, parameters, stages)
-        self._statistics.answer(stages, found.summary)
+        summary = found.summary(frame.is_cube)
+        self._statistics.answer(stages, summary)
         if found.recovery.doubt:
             self._statistics.doubt(found.recovery.doubt)
         if found.recovery.doubt or (found.recovery.bodies and found.recovery.message):
             self.get_logger().warning(found.recovery.message, throttle_duration_sec=THROTTLE)
-        return Outcome(True, found.summary, shown)
+        return Outcome(True, summary, shown)
 
     def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:
         """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""

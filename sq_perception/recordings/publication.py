@@ -33,7 +33,7 @@ from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import compressed_depth, depth_units, unit_cube
 from sq_perception.imaging.depth_units import Metres, Stated
-from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.recovery.recovery import FrameRecovery, edges_as_text
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
 
 CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
@@ -72,9 +72,8 @@ class Identified:
     hidden: tuple[int, ...] = ()
     columns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
-    @property
-    def summary(self) -> str:
-        """One frame's results in a line."""
+    def summary(self, is_cube: bool) -> str:
+        """One frame's results in a line: ids, status words and full edges, of the unit cube or in millimetres."""
         recovery = self.recovery
         remark = f": {recovery.message}" if recovery.message else ""
         took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms{remark}"
@@ -83,13 +82,10 @@ class Identified:
         parts = []
         for body, number in zip(recovery.bodies, self.ids, strict=True):
             if body.status == Status.FAILED:
-                parts.append(f"{number}: failed, {body.message}")
+                parts.append(f"{number} failed: {body.message}")
                 continue
-            size, shape = body.superquadric.size, body.superquadric.shape
-            parts.append(
-                f"{number}: a = {size[0]:.4f} {size[1]:.4f} {size[2]:.4f}, e = {shape[0]:.2f} {shape[1]:.2f}, "
-                f"score {body.score:.2f}"
-            )
+            edges = edges_as_text(body.superquadric.size, body.sigma_size, is_cube)
+            parts.append(f"{number} {body.status.name.lower()} {edges}, score {body.score:.2f}")
         count = len(recovery.bodies)
         return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)
 

@@ -211,7 +211,7 @@ def test_enable_and_trigger(bench):
     bench.send(bench.depth())
     bench.until(lambda: first.done() and second.done())
     assert first.result().success
-    assert first.result().message.startswith("1 body in 1 ms; 1: a = 0.1000 0.1000 0.1000, e = 1.00 1.00, score 0.90")
+    assert first.result().message.startswith("1 body in 1 ms; 1 converged 200 x 200 x 200 mm")
     assert bench.send(bench.depth()).dropped == 2
 
     refused = bench.ask(Trigger, "/recover_node/trigger")

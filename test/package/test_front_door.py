@@ -10,6 +10,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -116,3 +117,16 @@ def test_all_snippets_of_the_documents_are_python(repository: Path) -> None:
     for page in (repository / "README.md", *sorted((repository / "docs").glob("*.md"))):
         for text in snippets(page):
             compile(text, page.name, "exec")
+
+
+def test_read_frame_finds_the_camera_beside_an_image(tmp_path: Path) -> None:
+    """As the command does: in the file of the folder, or in that of the image's name."""
+    cv2.imwrite(str(tmp_path / "depth.png"), np.full((48, 64), 700, np.uint16))
+    with pytest.raises(ValueError, match=r"depth\.png"):
+        sq_perception.read_frame(tmp_path / "depth.png")
+    matrix = {"rows": 3, "cols": 3, "data": [60.0, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}
+    text = f"image_width: 64\nimage_height: 48\ncamera_matrix: {json.dumps(matrix)}\n"
+    (tmp_path / "camera_info.yaml").write_text(text + "distortion_model: plumb_bob\n")
+    frame = sq_perception.read_frame(tmp_path / "depth.png")
+    assert (frame.camera.fx, frame.camera.width) == (60, 64)
+    np.testing.assert_allclose(frame.depth, 0.7)
