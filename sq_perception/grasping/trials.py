@@ -72,7 +72,6 @@ class Trials(NamedTuple):
         return self.at(rows[rank < count])
 
 
-
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
     """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
     return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
