@@ -1,12 +1,18 @@
-"""Package of sq_perception and sq_msgs_py, for pip and for colcon (ament_python)."""
+"""Package of sq_perception and sq_msgs_py, for pip and for colcon (ament_python).
+
+Version, description, maintainer, license and address are those of package.xml.
+"""
 
 import sys
 from glob import glob
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import setup
 
-NAME = "sq_perception"
+HERE = Path(__file__).resolve().parent
+ABOUT = ElementTree.parse(HERE / "package.xml").getroot()  # noqa: S314 - our own
+NAME = ABOUT.findtext("name")
 NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 
 SUBPACKAGES = (
@@ -62,13 +68,15 @@ docs = [
 
 setup(
     name=NAME,
-    version="0.2.0",
-    description="Superquadrics from depth images: a network, exact fits and ROS 2 nodes",
-    long_description=Path(__file__).resolve().with_name("README.md").read_text(encoding="utf-8"),
+    version=ABOUT.findtext("version"),
+    description=ABOUT.findtext("description"),
+    long_description=(HERE / "README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
-    author="sq_perception maintainers",
-    author_email="sq-perception@example.org",
-    license="Apache-2.0",
+    maintainer=ABOUT.findtext("maintainer"),
+    maintainer_email=ABOUT.find("maintainer").get("email"),
+    license=ABOUT.findtext("license"),
+    url=ABOUT.findtext("url"),
+    keywords="superquadrics depth-image robotics perception ros2 grasping pose-estimation shape-recovery",
     python_requires=">=3.10",
     packages=[
         "sq_perception",

@@ -1,6 +1,6 @@
 """What one more stage of the camera does to the unseen side: the predicted hull, and the body fitted with it.
 
-    python benchmarks/camera_bias.py [--scenes 40] [--first 60000] [--models shipped ...] [--name camera_bias]
+    python benchmarks/camera_bias.py [--scenes 24] [--first 60000] [--name camera_bias]
 
 Household scenes (:mod:`household_things`) through the simulated D435, true masks given; then one stage more:
 
@@ -26,7 +26,6 @@ if __name__ == "__main__":
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
@@ -199,24 +198,19 @@ def kinds_table(result: dict[str, list[float]]) -> str:
 
 def main() -> None:
     parser = report.parser(__doc__, "camera_bias")
-    parser.add_argument("--scenes", type=int, default=40, help="number of household scenes")
+    parser.add_argument("--scenes", type=int, default=24, help="number of household scenes")
     parser.add_argument("--first", type=int, default=60000, help="seed of the first one")
-    parser.add_argument("--models", nargs="+", default=["shipped"], help="files of weights, or shipped")
     options = parser.parse_args()
-    scenes = [household_things.scene(seed, "stereo") for seed in range(options.first, options.first + options.scenes)]
-    result: dict[str, Any] = {}
-    texts = []
-    for model in options.models:
-        recoverer = Recoverer(None if model == "shipped" else model)
-        found = {
-            name: [side for scene in scenes for side in sides(scene, stage(scene), recoverer)]
-            for name, stage in STAGES.items()
-        }
-        result[Path(model).stem] = {"stages": figures(found), "kinds": by_kind(found["raw"])}
-        one = result[Path(model).stem]
-        texts.append(f"Weights: {Path(model).stem}\n\n{table(one['stages'])}\n\n{kinds_table(one['kinds'])}")
-        print(texts[-1], flush=True)
-    report.write(options.name, {"scenes": options.scenes, "first": options.first, **result}, "\n\n".join(texts))
+    recoverer = Recoverer()
+    found: dict[str, list[Side]] = {name: [] for name in STAGES}
+    for seed in range(options.first, options.first + options.scenes):
+        scene = household_things.scene(seed, "stereo")
+        for name, stage in STAGES.items():
+            found[name] += sides(scene, stage(scene), recoverer)
+    stages, kinds = figures(found), by_kind(found["raw"])
+    text = f"{table(stages)}\n\n{kinds_table(kinds)}"
+    seeds = {"scenes": options.scenes, "first": options.first}
+    report.write(options.name, {**seeds, "stages": stages, "kinds": kinds}, text)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """sensor_msgs/Image and CameraInfo to NumPy and back.
 
-Depth follows REP 118: 16UC1 holds millimetres with 0 for "no reading", 32FC1 holds metres with NaN.  In NumPy a depth
-image is always float32 (height, width) in metres, NaN where nothing was measured.  Pixels are read in place through
-their row stride (``step``) and byte order (``is_bigendian``); only the conversion to metres copies.
+Depth follows REP 118: 16UC1 holds millimetres with 0 for "no reading", 32FC1 holds metres with NaN; what is read are
+the numbers as they stand (:mod:`sq_perception.imaging.depth_units` makes metres of them), in place, through their row
+stride (``step``) and byte order (``is_bigendian``).
 
 What reads a message only looks at its fields, so that messages of rosbags, which come without a ROS installation, are
 read by the same code.  What makes one takes its class from ``types``, by default that of the ROS installation.
@@ -36,9 +36,8 @@ _DTYPES: dict[str, type[Any]] = {
     "32SC1": np.int32,
     "32FC1": np.float32,
 }
-_LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1e-2, 1e6
-"""What no camera goes beyond; lines of sight computed with less or more are no longer numbers."""
-_MILLIMETRES = np.float32(1000.0)
+_LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1.0, 1e6
+"""Pixels, of the whole image, that no camera goes beyond; a focal length of 1 is that of an identity, or normalised."""
 
 
 class ImageError(ValueError):
@@ -72,22 +71,6 @@ def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYP
             f"data: expected height x step = {height} x {step} = {height * step} bytes, got {len(message.data)}"
         )
     return np.ndarray((height, width), dtype, buffer=memoryview(message.data), strides=(step, dtype.itemsize))
-
-
-def depth_from_message(message: Image) -> np.ndarray:
-    """Depth in metres, float32 (height, width), of a 16UC1 or 32FC1 image; 0, negative, NaN and infinite become NaN.
-
-    Raises
-    ------
-    ImageError
-        As :func:`pixels_from_message`.
-    """
-    pixels = pixels_from_message(message, DEPTH_ENCODINGS)
-    depth = pixels.astype(np.float32)
-    if message.encoding == "16UC1":
-        depth /= _MILLIMETRES
-    depth[~((depth > 0) & (depth < np.inf))] = np.nan
-    return depth
 
 
 def grey_from_message(message: Image) -> np.ndarray:
@@ -258,6 +241,16 @@ def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
     return text
 
 
+def no_focal_length(fx: float, fy: float) -> str:
+    """The complaint where focal lengths are no pixels; empty where they may be."""
+    if min(fx, fy) > _LEAST_FOCAL_LENGTH:
+        return ""
+    return (
+        f"expected focal lengths in pixels, some hundreds, got fx = {fx:g}, fy = {fy:g}: "
+        "an identity in place of the camera's matrix, or one that was divided by the size of the image?"
+    )
+
+
 def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
     """Intrinsics of the region of interest in its binned pixels from those of the full resolution."""
     if not all(math.isfinite(number) for number in (fx, fy, cx, cy)):
@@ -267,10 +260,12 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
             f"camera_info: expected focal lengths above 0, got fx = {fx:g}, fy = {fy:g}"
             + (" (the camera is not calibrated)" if fx == 0.0 and fy == 0.0 else "")
         )
-    if min(fx, fy) < _LEAST_FOCAL_LENGTH or max(fx, fy, abs(cx), abs(cy)) > _MOST_PIXELS:
+    if fault := no_focal_length(fx, fy):
+        raise ImageError(f"camera_info: {fault}")
+    if max(fx, fy, abs(cx), abs(cy)) > _MOST_PIXELS:
         raise ImageError(
-            f"camera_info: expected focal lengths of {_LEAST_FOCAL_LENGTH:g} to {_MOST_PIXELS:g} pixels and a "
-            f"principal point within {_MOST_PIXELS:g}, got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
+            f"camera_info: expected focal lengths and a principal point within {_MOST_PIXELS:g} pixels, "
+            f"got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
         )
     width, height = int(message.width), int(message.height)
     region = message.roi

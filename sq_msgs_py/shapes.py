@@ -20,13 +20,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import exp, log, pi, sqrt
+from typing import TYPE_CHECKING
 
 import numpy as np
-from geometry_msgs.msg import Point
-from shape_msgs.msg import Mesh, MeshTriangle, SolidPrimitive
 
 from sq_msgs_py.markers import checked_mesh
 from sq_msgs_py.superquadrics import SuperquadricArray
+
+if TYPE_CHECKING:
+    from shape_msgs.msg import Mesh, SolidPrimitive
 
 BOX, CYLINDER, SPHERE = "box", "cylinder", "sphere"
 _SECTIONS = 257
@@ -53,6 +55,8 @@ class Primitive:
     @property
     def message(self) -> SolidPrimitive:
         """The solid as a message, centred at the origin of the body's pose."""
+        from shape_msgs.msg import SolidPrimitive
+
         kinds = {BOX: SolidPrimitive.BOX, CYLINDER: SolidPrimitive.CYLINDER, SPHERE: SolidPrimitive.SPHERE}
         return SolidPrimitive(type=kinds[self.kind], dimensions=list(self.dimensions))
 
@@ -61,7 +65,14 @@ def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
     """The box, cylinder or sphere of the least volume that encloses a body.
 
     Boxes with two small exponents become boxes; cylinders (e1 small, e2 near 1, a1 near a2) become cylinders; balls
-    become spheres; what is none of these mostly gets its bounding box.
+    become spheres; what is none of these mostly gets its bounding box.  Parameters and errors are those of
+    :func:`enclosing_solids`.
+    """
+    return min(enclosing_solids(size, shape), key=lambda one: one[0])[1]
+
+
+def enclosing_solids(size: np.ndarray, shape: np.ndarray) -> list[tuple[float, Primitive]]:
+    """The box, cylinder and sphere that enclose a body, each behind its volume in cubic metres.
 
     Parameters
     ----------
@@ -75,16 +86,14 @@ def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
     ValueError
         If a half size is not positive or an exponent not in (0, 2].
     """
-    (a1, a2, a3), (e1, e2) = _checked(size, shape)
+    (a1, a2, a3), (e1, e2) = (known.tolist() for known in _checked(size, shape))
     radius = sqrt(_largest(a1**2, a2**2, e2))
     outer = sqrt(_largest(radius**2, a3**2, e1))
-    candidates = (
-        (8 * a1 * a2 * a3, BOX, (2 * a1, 2 * a2, 2 * a3)),
-        (2 * pi * radius**2 * a3, CYLINDER, (2 * a3, radius)),
-        (4 / 3 * pi * outer**3, SPHERE, (outer,)),
-    )
-    _, kind, dimensions = min(candidates)
-    return Primitive(kind, dimensions)
+    return [
+        (8 * a1 * a2 * a3, Primitive(BOX, (2 * a1, 2 * a2, 2 * a3))),
+        (2 * pi * radius**2 * a3, Primitive(CYLINDER, (2 * a3, radius))),
+        (4 / 3 * pi * outer**3, Primitive(SPHERE, (outer,))),
+    ]
 
 
 def primitives(superquadrics: SuperquadricArray) -> list[Primitive]:
@@ -100,6 +109,9 @@ def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     ValueError
         If shapes or indices do not fit.
     """
+    from geometry_msgs.msg import Point
+    from shape_msgs.msg import Mesh, MeshTriangle
+
     vertices, faces = _checked_mesh(vertices, faces)
     return Mesh(
         vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()],

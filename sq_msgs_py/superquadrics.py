@@ -128,7 +128,10 @@ class SuperquadricArray(Columns):
     sigma_shape: np.ndarray | None = field(default=None, metadata=column("sigma_e1", "sigma_e2"))
     sigma_centre: np.ndarray | None = field(default=None, metadata=column("sigma_c1", "sigma_c2", "sigma_c3"))
     sigma_turn: np.ndarray | None = field(default=None, metadata=column("sigma_r1", "sigma_r2", "sigma_r3"))
-    taper: np.ndarray | None = field(default=None, metadata=column("kx", "ky", missing=0.0))
+    taper: np.ndarray = field(
+        default=None,  # type: ignore[arg-type]
+        metadata=column("kx", "ky", missing=0.0),
+    )
 
     @property
     def recovered(self) -> SuperquadricArray:

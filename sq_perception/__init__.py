@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from sq_perception.fitting.options import FitOptions
     from sq_perception.fitting.surface_fit import fit
     from sq_perception.geometry.mesh import export as write_mesh
+    from sq_perception.geometry.mesh import mesh, sample
+    from sq_perception.geometry.metrics import volume_iou as iou
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging.camera import Camera
     from sq_perception.imaging.raycast import render
@@ -37,9 +39,12 @@ __all__ = [
     "Superquadric",
     "__version__",
     "fit",
+    "iou",
+    "mesh",
     "read_frame",
     "recovery_figure",
     "render",
+    "sample",
     "write_mesh",
 ]
 
@@ -55,9 +60,12 @@ _HOMES = {
     "Status": "fitting.fit",
     "Superquadric": "geometry.superquadric",
     "fit": "fitting.surface_fit",
+    "iou": "geometry.metrics:volume_iou",
+    "mesh": "geometry.mesh",
     "read_frame": "recordings.frame_file:read",
     "recovery_figure": "evaluation.recovery_figure",
     "render": "imaging.raycast",
+    "sample": "geometry.mesh",
     "write_mesh": "geometry.mesh:export",
 }
 """The module of every name, and what it is called there if it is called otherwise."""

@@ -9,7 +9,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from sq_perception.files import output_file
 
@@ -34,9 +34,8 @@ class _Complaints(logging.Handler):
 
 
 def show_log() -> None:
-    """Print the package's warnings from now on, and that it has to compile, which takes minutes."""
+    """Print the package's warnings from now on."""
     log = logging.getLogger("sq_perception")
-    log.getChild("geometry.kernel_cache").setLevel(logging.INFO)
     if not log.handlers:
         log.addHandler(_Complaints())
 
@@ -58,9 +57,16 @@ def misused(message: str) -> int:
     return USAGE
 
 
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, without twenty lines of usage before it."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(USAGE, f"{self.prog}: {message}; {self.prog} --help shows all options\n")
+
+
 def parser(command: str, description: str, epilog: str | None = None) -> argparse.ArgumentParser:
     """The parser of one command, whose texts keep their lines."""
-    return argparse.ArgumentParser(
+    return Parser(
         prog=f"sq-perception {command}",
         description=description,
         epilog=epilog,
@@ -170,13 +176,31 @@ def add_frames(command: argparse.ArgumentParser) -> None:
     add(
         "--camera-info",
         metavar="FILE",
-        help="intrinsics of images and bags, before their own: YAML, JSON, 3 x 3 numbers or fx,fy,cx,cy",
+        help="intrinsics of images and bags, before their own: a file of K, or fx,fy,cx,cy",
     )
     add("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
+    add("--camera-info-topic", metavar="NAME", help="their camera_info, where it is not beside them")
+    add_depth(command)
     add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
     methods = ("auto", "network", "symmetry", "classic")
     add("--method", choices=methods, default="auto", help="how bodies are found: the methods of recover --help")
     add_ignore_masks(command)
+
+
+def add_depth(command: argparse.ArgumentParser) -> None:
+    """Add the options that tell what the numbers of depth images mean."""
+    command.add_argument(
+        "--depth-scale",
+        type=positive,
+        metavar="N",
+        help="units a metre (as a camera file states, else 1000 of whole numbers, 1 of floats)",
+    )
+    command.add_argument(
+        "--depth-kind",
+        choices=("z", "range"),
+        default="z",
+        help="range: images hold the distance to the camera's centre (Isaac's distance_to_camera), not z",
+    )
 
 
 def add_ignore_masks(command: argparse.ArgumentParser) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import add_ignore_masks, folder, parser, positive, text_target
+from sq_perception.commands.console import add_depth, add_ignore_masks, folder, parser, positive, text_target
 
 HELP = """\
 Plan grasps of a parallel gripper on the objects of recorded depth images.
@@ -14,12 +14,12 @@ A FRAME is what 'sq-perception recover' reads: an .npz with depth and K, a PNG w
 EPILOG = """\
 output:
   {"format": "sq_perception.grasps", "version": 1, "options": {...},
-   "frames": [{"file": ..., "stamp": {"sec": ..., "nanosec": ...}, "bodies": [{"label": ..., "reason": ...,
+   "frames": [{"file": ..., "stamp": {"sec": ..., "nanosec": ...}, "bodies": [{"body": ..., "label": ..., "reason": ...,
    "grasps": [{"position": [x, y, z], "rotation": [x, y, z, w], "opening": ..., "width": ..., "score": ...,
    "weakest": ...}, ...]}, ...]}, ...]}
   Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z the approach, y the
   way of the fingers.  "score" is the probability that the grasp holds, the best first; "weakest" what takes most from
-  it.  A body without a grasp has the reason; those that could not be recovered come last.  The stamp is null where a
+  it.  Bodies are numbered as `recover` numbers them; one without a grasp has the reason.  The stamp is null where a
   frame has none.
 
 examples:
@@ -37,6 +37,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--friction", type=positive, help="between pads and things at the least (default 0.5)")
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
     add("--topic", metavar="TOPIC", help="the depth topic of a bag that has several")
+    add_depth(command)
     add_ignore_masks(command)
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")

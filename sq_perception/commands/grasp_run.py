@@ -44,7 +44,7 @@ def run(options: argparse.Namespace) -> int:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        reading = Reading(ignore_masks=options.ignore_masks)
+        reading = Reading(options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind)
         recorded = RecordedInput(
             options.frames, InputOptions(options.camera_info, topic=options.topic, reading=reading)
         )
@@ -88,8 +88,8 @@ def _plan_all(
             if frame.is_cube:
                 code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
                 continue
-            if frame.warning:
-                complain(f"warning: {frame.name}: {frame.warning}")
+            for text in filter(None, (frame.warning, frame.notes)):
+                complain(f"{file}: {text}")
             stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
             try:
                 bodies = _bodies(stem, frame, recoverer, hand, friction, options)
@@ -109,52 +109,61 @@ def _plan_all(
 def _bodies(
     stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """The element ``bodies`` of a frame, those that failed last; writes its picture and its mesh if they are wanted."""
+    """The element ``bodies`` of a frame, numbered as by ``recover``; writes its picture and mesh if wanted."""
     settings = RecoveryOptions(free_space=frame.has_free_space)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:
         complain(f"{frame.name}: {recovery.message}")
     found = recovery.recovered
+    numbers = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     bodies = Superquadric.stack([recovered.superquadric for recovered in found])
     covariance = np.array([recovered.covariance for recovered in found]).reshape(-1, 11, 11)
     around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)
     plan = planner.grasps(bodies, hand, covariance, around, friction)
     if options.pictures:
-        _draw(options.pictures / f"{stem}.png", frame, found, plan, hand)
+        _draw(options.pictures / f"{stem}.png", frame, found, numbers, plan, hand)
     if options.meshes and found:
-        _write_mesh(options.meshes / f"{stem}.glb", found, plan, hand)
-    planned = [
+        _write_mesh(options.meshes / f"{stem}.glb", found, numbers, plan, hand)
+    planned = dict(zip(numbers, range(len(found)), strict=True))
+    return [
         {
-            "label": int(recovered.label),
-            "reason": plan.reasons[k],
-            "grasps": [{name: getattr(grasp, name) for name in _OF_EACH_GRASP} for grasp in plan.of(k)],
+            "body": number,
+            "label": int(body.label),
+            "reason": plan.reasons[planned[number]] if number in planned else f"failed: {body.message}",
+            "grasps": [{name: getattr(grasp, name) for name in _OF_EACH_GRASP} for grasp in plan.of(planned[number])]
+            if number in planned
+            else [],
         }
-        for k, recovered in enumerate(found)
-    ]
-    failures = [body for body in recovery.bodies if body.status == Status.FAILED]
-    return planned + [
-        {"label": int(body.label), "reason": f"failed: {body.message}", "grasps": []} for body in failures
+        for number, body in enumerate(recovery.bodies)
     ]
 
 
-def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
+def _draw(
+    path: Path,
+    frame: RecordedFrame,
+    found: Sequence[Recovery],
+    numbers: Sequence[int],
+    plan: GraspPlan,
+    hand: Gripper,
+) -> None:
     from sq_perception.evaluation import plots
 
     # Of an image of few columns the picture would have more pixels than fit into memory, of one of few rows none.
     form = min(max(frame.camera.height / frame.camera.width, 1 / _LONGEST), _LONGEST)
     figure = plots.new_figure(9.6, 9.6 * form)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    plots.draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
+    bodies = [recovered.superquadric for recovered in found]
+    plots.draw_grasps(ax, frame.depth, frame.camera, bodies, plan, hand, numbers)
     plots.save(figure, path)
 
 
-def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
+def _write_mesh(path: Path, found: Sequence[Recovery], numbers: Sequence[int], plan: GraspPlan, hand: Gripper) -> None:
     """Bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
     solids = [recovered.superquadric for recovered in found]
-    names = [f"body_{k}" for k in range(len(found))]
-    owner = list(range(len(found)))
-    for k in range(len(found)):
-        for grasp in plan.of(k)[:1]:
+    names = [f"body_{k}" for k in numbers]
+    owner = list(numbers)
+    for place, k in enumerate(numbers):
+        for grasp in plan.of(place)[:1]:
             boxes = hand.boxes(grasp.opening, reach=0.0)
             for name, box in zip(("left", "right", "hand"), boxes, strict=True):
                 solids.append(Superquadric(box[3:], np.full(2, _SHARP), grasp.placed(box[None, :3])[0], grasp.rotation))
@@ -172,5 +181,5 @@ def _print_table(entries: Sequence[dict[str, Any]]) -> None:
             if body["grasps"]:
                 best = body["grasps"][0]
                 at = " ".join(f"{value:.3f}" for value in best["position"])
-                text = f"{best['score']:.2f}  at {at} m, {1e3 * best['opening']:.0f} mm open"
-            print(f"  {body['label']:4d}  {text}")
+                text = f"score {best['score']:.2f} at {at} m, {1e3 * best['opening']:.0f} mm open"
+            print(f"  {body['body']} {text}")

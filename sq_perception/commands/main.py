@@ -15,11 +15,12 @@ import sys
 from collections.abc import Sequence
 from pkgutil import resolve_name
 
-from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain, show_log
+from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, Parser, complain, show_log
 from sq_perception.files.version import __version__
 from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {
+    "sample": ("sample:main", "write a simulated depth image to begin with"),
     "recover": ("recover:main", "depth images in, superquadrics out"),
     "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
     "render": ("render:main", "draw a superquadric as a depth image"),
@@ -38,6 +39,7 @@ COMMANDS = {
 
 _EPILOG = """\
 examples:
+  sq-perception sample table.npz
   sq-perception recover table.npz --json out.json --pictures pictures/
   sq-perception render 0.25 0.15 0.1  0.2 0.8  0.5 0.5 0.5  0 0 0 1 --output view.png
   sq-perception demo
@@ -90,7 +92,7 @@ def _run(given: list[str]) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="sq-perception",
         description="Superquadrics from depth images: size, shape, pose and uncertainty of the objects in them.",
         epilog=_EPILOG,

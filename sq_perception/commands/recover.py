@@ -93,6 +93,11 @@ meshes:
   One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
   has the coordinates of the JSON.  GLB turns the optical frame half about x, as its y axis points up, and names each
   body by its place in "superquadrics": body_0, body_1, ...
+
+obstacles:
+  --export writes a file a frame for planners and simulators, in metres, in the frame of the JSON.  Each body is the
+  box, cylinder, sphere or capsule (not in URDF) of the least volume that encloses it; --inflate makes it larger by what
+  is not known of it.  Meshes of URDF and SDF are STL files beside it.
 """
 
 
@@ -105,12 +110,6 @@ def main(arguments: Sequence[str]) -> int:
     add("--jsonl", type=text_target, metavar="OUT", help="a line for each frame; those it has are skipped, see below")
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
     add("--html", type=target, metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
-    add(
-        "--depth-scale",
-        type=float,
-        metavar="N",
-        help="units a metre (1000 of whole numbers, 5000 of TUM RGB-D, 1 of floats)",
-    )
     add("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
     add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
     add(
@@ -129,7 +128,19 @@ def main(arguments: Sequence[str]) -> int:
     add("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write the bodies of each frame as a mesh into this folder")
-    add("--mesh-format", choices=("glb", "ply"), default="glb", help="of --meshes (default glb)")
+    add("--mesh-format", choices=("glb", "ply", "stl", "obj", "dae"), default="glb", help="of --meshes (default glb)")
+    add(
+        "--export", choices=("urdf", "sdf", "mjcf", "curobo"), help="write the bodies of each frame as obstacles, below"
+    )
+    add("--export-folder", type=folder, metavar="DIR", default=Path(), help="where to (default: here)")
+    add("--export-meshes", action="store_true", help="as close meshes, not as the smallest enclosing solids")
+    add(
+        "--inflate",
+        type=number("a number from 0", lambda value: value >= 0),
+        default=0.0,
+        metavar="K",
+        help="make them larger by K standard deviations",
+    )
     add("--mcap", type=target, metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
     add(
         "--mcap-images",

@@ -12,12 +12,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from sq_perception.commands import console
 from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import mesh
-from sq_perception.recordings import bag_file, result_json
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recordings import bag_file, result_json, scene_export
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.publication import CAMERA_FRAME
 from sq_perception.recordings.result_json import in_result_frame
 from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.tracking.session import Followed
@@ -31,7 +35,9 @@ _DECISIVE = (
     "projection",
     "method",
     "camera_info",
+    "camera_info_topic",
     "depth_scale",
+    "depth_kind",
     "depth_min",
     "depth_max",
     "roi",
@@ -62,6 +68,8 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
         if other != name:
             return f"--{other}, --{name}: {file}: expected a file for each of them"
     folders = {"pictures": (options.pictures, ".png"), "meshes": (options.meshes, f".{options.mesh_format}")}
+    if options.export:
+        folders["export-folder"] = options.export_folder, scene_export.SUFFIXES[options.export]
     return console.replaced_input(inputs, files, folders)
 
 
@@ -122,6 +130,12 @@ class Outputs:
         for folder, suffix, stems, thing in (
             (options.pictures, "png", list(given), "a picture"),
             (options.meshes, options.mesh_format, with_bodies, "a mesh of their bodies"),
+            (
+                options.export and options.export_folder,
+                scene_export.SUFFIXES.get(options.export, ".")[1:],
+                with_bodies,
+                "a scene",
+            ),
         ):
             lost = sum(not (folder / f"{stem}.{suffix}").is_file() for stem in stems) if folder else 0
             if lost:
@@ -145,6 +159,10 @@ class Outputs:
             _draw(options.pictures / f"{stem}.png", frame, recovery)
         if options.meshes:
             _write_mesh(options.meshes / f"{stem}.{options.mesh_format}", frame, recovery)
+        if options.export:
+            _write_scene(
+                options.export_folder / f"{stem}{scene_export.SUFFIXES[options.export]}", frame, recovery, options
+            )
         if self._bag is not None:
             try:
                 self._bag.add(frame, recovery, tracks)
@@ -251,3 +269,26 @@ def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> No
             names=[f"body_{k}" for k in shown],
             optical=not frame.is_cube,
         )
+
+
+def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, options: argparse.Namespace) -> None:
+    """The bodies of a frame as obstacles, no file where there is none; FrameError for a frame without metres."""
+    shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
+    if not shown:
+        return
+    try:
+        if frame.is_cube:
+            raise ValueError("frames of the unit cube have no metres")
+        bodies = [recovery.bodies[k] for k in shown]
+        covariances = np.array([body.covariance for body in bodies])
+        stack = Superquadric.stack([body.superquadric for body in bodies])
+        scene_export.write(
+            scene_export.grown(stack, covariances, options.inflate),
+            path,
+            options.export,
+            names=[f"body_{k}" for k in shown],
+            frame=CAMERA_FRAME,
+            meshes=options.export_meshes,
+        )
+    except ValueError as error:
+        raise FrameError(f"{frame.name}: --export: {error}") from error

@@ -99,7 +99,9 @@ class RecoverRun:
                 options.roi,
                 options.masks,
                 options.ignore_masks,
+                options.depth_kind,
             ),
+            options.camera_info_topic,
         )
         self._recorded = RecordedInput(options.frames, wanted, done)
         if problem := replaced_input(options, self._recorded.files):
@@ -114,7 +116,7 @@ class RecoverRun:
         is_tracked = options.track or poses is not None
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}"), poses) if is_tracked else None
         self._unreadable = 0
-        self._warnings: dict[str, set[str]] = {}
+        self._said: dict[str, set[str]] = {}
 
     def _chosen_executor(self) -> Recoverer | workers.Processes | workers.Cluster:
         options = self._options
@@ -143,9 +145,9 @@ class RecoverRun:
             complain("interrupted; what is done so far is kept")
             return console.INTERRUPTED
         finally:
-            for warning, files in self._warnings.items():
+            for text, files in self._said.items():
                 if len(files) > 1:
-                    complain(f"warning: {_count(len(files) - 1, 'more file')}: {warning}")
+                    complain(f"{_count(len(files) - 1, 'more file')}: {text}")
         self.is_whole = True
         return FAILURE if self._unreadable else console.SUCCESS
 
@@ -197,10 +199,11 @@ class RecoverRun:
             yield pair, answer
 
     def _frame(self, file: str, frame: RecordedFrame, answer: FrameRecovery | Exception) -> None:
-        if frame.warning:
-            if frame.warning not in self._warnings:
-                complain(f"warning: {file}: {frame.warning}")
-            self._warnings.setdefault(frame.warning, set()).add(file)
+        for text in (f"warning: {frame.warning}" if frame.warning else "", frame.notes):
+            if text and text not in self._said:
+                complain(f"{file}: {text}")
+            if text:
+                self._said.setdefault(text, set()).add(file)
         if isinstance(answer, (ValueError, ArithmeticError, workers.WorkerLostError)):  # such as a camera of no image
             raise FrameError(f"{file}: {frame.name}: {answer}") from answer
         if isinstance(answer, Exception):

@@ -5,6 +5,7 @@ Compiled code is kept beside the modules, or in the user's cache where that fold
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable, Sequence
 
@@ -16,6 +17,7 @@ _HELP = "Compile every kernel once and keep it on disk (about two minutes), so t
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception warm-up``: run every step and print how long each took."""
     parser("warm-up", _HELP).parse_args(arguments)
+    logging.getLogger("sq_perception.geometry.kernel_cache").setLevel(logging.ERROR)  # it says itself how far it is
     for name, action in steps():
         began = time.perf_counter()
         print(f"preparing {name} ...", end=" ", flush=True)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -103,20 +104,42 @@ def draw_outlines(
 
 
 def draw_grasps(
-    ax: Axes, depth: np.ndarray, camera: Camera, bodies: list[Superquadric], plan: GraspPlan, hand: Gripper
+    ax: Axes,
+    depth: np.ndarray,
+    camera: Camera,
+    bodies: Sequence[Superquadric],
+    plan: GraspPlan,
+    hand: Gripper,
+    numbers: Sequence[int] | None = None,
 ) -> None:
-    """A depth image, the outlines of its bodies and, at the best grasp of each, the gripper with its probability."""
+    """A depth image, the outlines of its bodies and, at the best grasp of each, the gripper with its probability.
+
+    A body without a grasp has the reason.  ``numbers`` are those of the bodies, 0, 1, ... if not given.  What of a
+    gripper lies beyond the image is shown beside it, up to a quarter of the image away.
+    """
     draw_depth(ax, depth)
-    draw_outlines(ax, bodies, camera, edges=False, width=1.4)
-    for k in range(len(bodies)):
+    numbers = range(len(bodies)) if numbers is None else numbers
+    draw_outlines(ax, bodies, camera, [colour(number) for number in numbers], edges=False, width=1.4)
+    spots = [np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])]
+    for k, number in enumerate(numbers):
+        where, words = camera.project(bodies[k].translation), f"{number}: {shorten(plan.reasons[k], 44)}"
         for grasp in plan.of(k)[:1]:
             for line in hand.wires(grasp.opening):
                 pixels = camera.project(grasp.placed(line))
                 ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
-                ax.plot(*pixels.T, color=colour(k), lw=2.6, solid_capstyle="round")
-            where = float(pixels[-1, 0]), float(pixels[-1, 1])
-            text = ax.text(*where, f" {grasp.score:.2f}", color=INK, fontsize=11, weight="bold", clip_on=True)
-            text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])  # the picture may be as dark as INK
+                ax.plot(*pixels.T, color=colour(number), lw=2.6, solid_capstyle="round")
+                spots.append(pixels)
+            where, words = pixels[-1], f"{number}: {grasp.score:.2f}"
+        # Beyond the left half of the picture words go to the right, else to the left: they stay within it.
+        side = "left" if where[0] < camera.width / 2 else "right"
+        text = ax.text(*where, f" {words} ", color=INK, fontsize=10, weight="bold", ha=side, va="center", clip_on=True)
+        text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])  # the picture may be as dark as INK
+    border = 0.25 * np.array([camera.width, camera.height])
+    shown = np.vstack(spots)
+    shown = shown[np.isfinite(shown).all(axis=1)]
+    low = np.maximum(shown.min(axis=0) - 0.5, -border)
+    high = np.minimum(shown.max(axis=0) + 0.5, spots[0][1] + border)
+    ax.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), facecolor="white", anchor="C")
 
 
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:

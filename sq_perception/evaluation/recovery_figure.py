@@ -54,7 +54,7 @@ def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, 
     for k, body in shown:
         _draw_open_axes(right, body, camera)
         _number(right, camera.project(body.superquadric.translation), k)
-    plots.heading_of(right, "Recovered outlines", "faint: hidden edges; axes: left open")
+    plots.heading_of(right, "Recovered outlines", "dashed: hidden edges; red axis: size hardly seen")
 
     points = camera.points(depth)
     clouds = [points[(recovery.labels == body.label) & np.isfinite(depth)] for _, body in shown]

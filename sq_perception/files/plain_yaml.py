@@ -51,11 +51,18 @@ def read_all(path: Path) -> list[Any]:
     """
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
-        if len(data) > LARGEST:
-            raise YamlError(f"expected at most {LARGEST} bytes")
+            return documents(file.read(LARGEST + 1))
+    except OSError as error:
+        raise YamlError(str(error)) from error
+
+
+def documents(data: bytes) -> list[Any]:
+    """The documents of a file's bytes.  Raises YamlError as :func:`read_all` does."""
+    if len(data) > LARGEST:
+        raise YamlError(f"expected at most {LARGEST} bytes")
+    try:
         return list(yaml.load_all(data.decode("utf-8"), Loader=_PlainLoader))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+    except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, YamlError):
             raise
         reason = " ".join(str(error).split()) or type(error).__name__

@@ -31,8 +31,8 @@ class UnpackingError(ValueError):
     """A file that cannot be unpacked, or would become too large; the message names what was expected."""
 
 
-def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
-    """The arrays of an NPZ archive that have these names, by name.
+def npz_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, np.ndarray]:
+    """The arrays of an NPZ archive that have these names, by name; all of them by default.
 
     Raises
     ------
@@ -41,8 +41,8 @@ def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            held = {info.filename: info for info in archive.infolist()}
-            return {name: _array(archive, held[f"{name}.npy"]) for name in names if f"{name}.npy" in held}
+            held = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            return {name: _array(archive, held[name]) for name in (held if names is None else names) if name in held}
     except Exception as error:  # whatever damaged files lead to: NumPy reads their headers as Python of old
         raise UnpackingError(f"not a readable NPZ archive: {error}") from error
 

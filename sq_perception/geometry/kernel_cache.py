@@ -60,7 +60,7 @@ class _Compiling(Listener):
 
 @cache
 def _announce() -> None:
-    _log.info("compiling, once for this installation: all kernels take about two minutes")
+    _log.warning("compiling, once for this installation: all kernels take about two minutes")
 
 
 @cache

@@ -23,6 +23,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from sq_msgs_py.depth_image import no_focal_length
+
 Projection = Literal["pinhole", "orthographic"]
 LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
 """Median depths, metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
@@ -79,6 +81,8 @@ class Camera:
             raise ValueError(f"camera matrix: expected 3 x 3, got {k.shape}")
         if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
             raise ValueError(f"camera matrix: expected no skew, got {k[0, 1]:g}")
+        if k[0, 0] > 0 and (fault := no_focal_length(k[0, 0], k[1, 1])):
+            raise ValueError(fault)
         camera = cls(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
         if not np.allclose(k[2], [0, 0, 1]):
             turned = "; it seems to be transposed" if k[2, :2].any() and not k[:2, 2].any() else ""

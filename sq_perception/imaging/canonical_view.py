@@ -72,7 +72,7 @@ class CanonicalView:
     beside : float32 (n, n)
         How much nearer what was measured beside the object is than its nearest surface there, in sides of the view,
         -1 to 1: positive before it, 0 flush with it, -1 far behind it, on the plane, or not asked for.  Where nothing
-        was measured +inf within the mask, and NaN where the object may go on beyond it.
+        was measured +inf within the mask, and NaN where the object may go on beyond it, else -1.
     rotation : (4,)
         Quaternion, optical frame to canonical frame.
     anchor : (3,)
@@ -165,8 +165,9 @@ def from_mask(
         hides nothing.
     missing_is_hidden : bool
         Whether the object may go on at every pixel without a reading, on it and beside it, and beyond the image; asks
-        for ``find_hidden`` too.  By default a pixel that measured nothing hides something within the object's convex
-        hull only.
+        for ``find_hidden`` too.  A mask that covers pixels without a reading was not made of readings, and so knows
+        where the object ends: beside such a mask they show nothing of it.  By default a pixel that measured nothing
+        hides something within the object's convex hull only.
 
     Raises
     ------
@@ -205,7 +206,11 @@ def from_mask(
     filled = image.ravel()[regions.nearest(~np.isnan(image))] if is_asked else image
     nearer = np.full(mask.shape, np.float32(-np.inf))
     if find_hidden:
-        lost = np.ones_like(mask) if missing_is_hidden else _within_hull(mask & np.isfinite(depth))
+        read = mask & np.isfinite(depth)
+        if missing_is_hidden:
+            lost = mask if (mask & ~read).any() else np.ones_like(mask)
+        else:
+            lost = _within_hull(read)
         ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
         nearer = _nearer(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)

@@ -30,7 +30,6 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _IMAGE_HEADER = struct.Struct(">8xI4sIIBB")
 """The beginning of a PNG: length and name of its first chunk, width, height, bits, colour type (0 is grey)."""
 _RVL_HEADER = struct.Struct("<II")
-_MILLIMETRES = np.float32(1000.0)
 
 
 def encoding(image_format: str) -> str | None:
@@ -55,7 +54,8 @@ def size(image_format: str, data: bytes | np.ndarray) -> tuple[int, int]:
 
 
 def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
-    """Depth in metres, float32 (height, width), NaN where nothing was measured.
+    """The numbers of the image before it was packed (height, width): uint16 of 16UC1, float32 metres of 32FC1, 0 and NaN
+    for nothing.
 
     Parameters
     ----------
@@ -76,11 +76,10 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
         grey = _grey(message)
     _, a, b = _HEADER.unpack_from(message)
     if packed == "16UC1":
-        depth: np.ndarray = grey / _MILLIMETRES
-    else:
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            depth = np.float32(a) / (grey.astype(np.float32) - np.float32(b))
-    depth[(grey == 0) | ~((depth > 0) & (depth < np.inf))] = np.nan
+        return grey
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        depth: np.ndarray = np.float32(a) / (grey.astype(np.float32) - np.float32(b))
+    depth[grey == 0] = np.nan
     return depth
 
 

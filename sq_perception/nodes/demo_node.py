@@ -15,11 +15,10 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Image, PointCloud2
 
-from sq_msgs_py.depth_image import depth_from_message
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.nodes.frame import stamp_of
-from sq_perception.recordings.publication import superquadrics
+from sq_perception.recordings.publication import depth_of, superquadrics
 
 IMAGE, TRUTH = "depth/image", "synthetic_depth_node/truth"
 _REMEMBERED = 40
@@ -84,5 +83,5 @@ class DemoNode(Node):
             self._due = time.monotonic() + self._seconds
         bodies = {each: superquadrics(from_message(parts[each][0]).recovered) for each in (TRUTH, *self._nodes)}
         delay = {each: parts[each][1] for each in self._nodes}
-        self.shots.append(Shot(depth_from_message(parts[IMAGE][0]), bodies.pop(TRUTH), bodies, delay))
+        self.shots.append(Shot(depth_of(parts[IMAGE][0], is_cube=False)[0].depth, bodies.pop(TRUTH), bodies, delay))
         del self._waiting[stamp]

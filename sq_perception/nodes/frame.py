@@ -19,11 +19,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message, size_mismatch
 from sq_msgs_py.points import points_from_message
-from sq_perception.imaging import compressed_depth, unit_cube
+from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.parameters import POINTS, RAW
 from sq_perception.recordings import cloud_file, publication
+from sq_perception.recordings.publication import size_of
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
@@ -50,6 +51,7 @@ class Frame:
     ``depth`` (height, width) is float32, metres in the optical frame, NaN where nothing was measured, rectified as the
     int32 ``labels`` are; ``encoding`` is that of the message before it was packed.  ``has_free_space``: whether a
     pixel beside an object shows that there is nothing before what it measured; not so for a cloud that is no image.
+    ``notes`` say what was found out about the message's numbers.
     """
 
     header: Any
@@ -58,6 +60,7 @@ class Frame:
     calibration: Calibration
     labels: np.ndarray | None = None
     has_free_space: bool = True
+    notes: tuple[str, ...] = ()
 
     @property
     def camera(self) -> Camera:
@@ -82,7 +85,9 @@ class Frame:
         return publication.depth_message(self.calibration.as_sent(depth), self.header, self.encoding)
 
 
-def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | None) -> Frame:
+def decode(
+    message: DepthMessage, calibration_of: Callable[[], Calibration] | None, scale: float | None = None, kind: str = "z"
+) -> Frame:
     """The frame of a depth image message; raises ValueError for anything that keeps it from being processed.
 
     Parameters
@@ -93,9 +98,11 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
     calibration_of
         Looks up the calibration; only called for an image that is sound itself.  None for images of the unit cube, not
         asked for clouds.
+    scale, kind
+        Units a metre, None: by the encoding; and whether the image holds "z" or "range".
     """
     if isinstance(message, PointCloud2):
-        depth, seen, is_image = cloud_file.as_image(points_from_message(message))
+        depth, seen, is_image = cloud_file.as_image(points_from_message(message) / np.float32(scale or 1.0))
         numbers = {name: round(getattr(seen, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
         calibration = Calibration(replace(seen, **numbers))
         return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)
@@ -105,17 +112,20 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
                 f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
                 "metric depth images of a camera need projection = pinhole"
             )
-        depth, encoding = publication.depth_of(message, is_cube=True)
-        height, width = depth.shape
-        return Frame(message.header, encoding, depth, Calibration(unit_cube.camera(width, height)))
+        found, encoding = publication.depth_of(message, is_cube=True)
+        height, width = found.depth.shape
+        return Frame(message.header, encoding, found.depth, Calibration(unit_cube.camera(width, height)))
     if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
         raise ValueError(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )
-    depth, encoding = publication.depth_of(message, is_cube=False)
+    found, encoding = publication.depth_of(message, False, scale)
     calibration = calibration_of()
-    return Frame(message.header, encoding, calibration.rectified(depth), calibration)
+    depth = calibration.rectified(found.depth)
+    if kind == "range":
+        depth = depth_units.z_from_range(depth, calibration.camera)
+    return Frame(message.header, encoding, depth, calibration, notes=found.notes)
 
 
 def decode_by(info: CameraInfo | None, image: Image, topic: str) -> Frame:
@@ -164,8 +174,3 @@ def stamp_of(message: Any) -> int:
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
-def size_of(message: DepthMessage) -> tuple[int, int]:
-    """Width and height of a depth image; of a packed one from its header alone, ValueError if it is none."""
-    if isinstance(message, CompressedImage):
-        return compressed_depth.size(message.format, message.data)
-    return int(message.width), int(message.height)

@@ -274,7 +274,9 @@ class FrameNode(ManagedNode):
             stages["stamp to result"] = 1e3 * age
         self._outputs.accompany(found, shown, frame, parameters, stages)
         self._statistics.answer(stages, found.summary)
-        if found.recovery.bodies and found.recovery.message:
+        if found.recovery.doubt:
+            self._statistics.doubt(found.recovery.doubt)
+        if found.recovery.doubt or (found.recovery.bodies and found.recovery.message):
             self.get_logger().warning(found.recovery.message, throttle_duration_sec=THROTTLE)
         return Outcome(True, found.summary, shown)
 

@@ -132,7 +132,7 @@ class GraspNode(ManagedNode):
         return 1e-9 * self.get_clock().now().nanoseconds
 
     def _age(self, cloud: PointCloud2) -> float:
-        """Seconds since the image of the last cloud; since the cloud came where it has no stamp, or one of another clock."""
+        """Seconds since the image of the last cloud; since the cloud came where its stamp is of another clock."""
         now, stamp = self._now(), 1e-9 * stamp_of(cloud)
         since = max(now - self._arrival, 0.0)
         return max(now - stamp, since) if stamp and now - stamp < OLDEST else since

@@ -27,7 +27,6 @@ from sq_perception.nodes.frame import (
     decode,
     image_topic,
     listen_to_latched_info,
-    size_of,
     stamp_of,
 )
 from sq_perception.nodes.listener import Listener
@@ -35,6 +34,7 @@ from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
 from sq_perception.recordings.cloud_file import UNORGANISED
+from sq_perception.recordings.publication import size_of
 
 _INFOS = 16
 _MASKS = 8
@@ -85,6 +85,7 @@ class Input:
         self.topic = image_topic(node, transport)
         """Topic of the depth images."""
         self._note = ""
+        self._numbers_note: tuple[str, ...] = ()
         self._last_image = monotonic()
         self._changed = threading.Condition()
         """Guards what follows."""
@@ -173,7 +174,15 @@ class Input:
             For anything that keeps it from being processed.
         """
         message, use, source = arrival.message, parameters.use_masks, self._info
-        frame = decode(message, None if source is None else lambda: self._calibration_of(message, source))
+        frame = decode(
+            message,
+            None if source is None else lambda: self._calibration_of(message, source),
+            parameters.depth_scale or None,
+            parameters.depth_kind,
+        )
+        if frame.notes and frame.notes != self._numbers_note:
+            self._numbers_note = frame.notes
+            self._node.get_logger().info(f"{self.topic}: {'; '.join(frame.notes)}", throttle_duration_sec=THROTTLE)
         if not frame.has_free_space:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
             if use == "always":

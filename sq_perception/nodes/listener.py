@@ -122,7 +122,7 @@ class Listener:
         events = SubscriptionEventCallbacks(
             matched=lambda _: self._follow_publishers(),
             incompatible_qos=lambda _: self._on_incompatible(),
-            message_lost=lambda event: self._on_lost(event.total_count, event.total_count_change),
+            message_lost=self._on_message_lost,
         )
         overridable = QoSOverridingOptions(policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH))
         made = self._node.create_subscription(
@@ -147,6 +147,9 @@ class Listener:
             self._follow_publishers()
         else:
             self._node.get_logger().warning(f"{self.topic}: {self.publishers}", throttle_duration_sec=THROTTLE)
+
+    def _on_message_lost(self, event: Any) -> None:
+        self._on_lost(event.total_count, event.total_count_change)
 
     def _on_lost(self, total: int, new: int) -> None:
         self._statistics.lose(self.topic, new)

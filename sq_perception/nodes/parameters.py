@@ -14,6 +14,7 @@ from sq_perception.grasping.planner import FRICTION, PLACEMENT
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
+from sq_perception.imaging.depth_units import DepthKind
 from sq_perception.nodes.live_parameters import ParameterError, Parameters, setting
 from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.segmentation.options import Box, Pose
@@ -78,6 +79,18 @@ class RecoverParameters(Parameters):
         "images' topic has the word rect or rectified.",
         choices=get_args(Treatment),
         live=False,
+    )
+    depth_scale: float = setting(
+        0.0,
+        "Units a metre of depth images and points; 0: 1000 of 16UC1, 1 of 32FC1 and points. 32FC1 in millimetres: "
+        "1000; a D405's 16UC1: 10000.",
+        within=(0.0, 1e6),
+    )
+    depth_kind: DepthKind = setting(
+        "z",
+        "What depth images hold: z along the optical axis, or range, the distance to the camera's centre (Isaac's "
+        "distance_to_camera).",
+        choices=get_args(DepthKind),
     )
     s: float = setting(
         RecoveryOptions.sharpness,
@@ -184,7 +197,8 @@ class RecoverParameters(Parameters):
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
             )
-        for name, expected in (("image_transport", RAW), ("fixed_frame", ""), ("target_frame", "")):
+        for name in ("image_transport", "fixed_frame", "target_frame", "depth_scale", "depth_kind"):
+            expected = RecoverParameters.__dataclass_fields__[name].default
             given = getattr(self, name)
             if self.projection == "orthographic" and given != expected:
                 raise ParameterError(

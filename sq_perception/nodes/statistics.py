@@ -26,6 +26,8 @@ _MOST = 5000
 """Events that are kept: more than any camera causes in that time."""
 WITHOUT_MASK = "without mask"
 """Frames that were segmented by the node, though somebody publishes masks."""
+DOUBTED = "doubted"
+"""Frames that seem to be in another unit or of another kind."""
 _OUTCOMES = ("answered", "dropped", "refused")
 _SLOW = 3.0
 """Seconds after which a frame without an outcome is more than a start."""
@@ -47,7 +49,7 @@ class Statistics:
         """Counts, and lost ones, when the last status was made."""
         self._stood = self._started
         """When something else than frames was last reported, such as that nobody wants them."""
-        self._last_error = self._last_answer = ""
+        self._last_error = self._last_answer = self._last_doubt = ""
 
     def count(self, what: str, number: int = 1) -> None:
         """Add to received or dropped, or to WITHOUT_MASK."""
@@ -65,6 +67,11 @@ class Statistics:
         self._last_error = f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {reason}"
         self.count("refused")
 
+    def doubt(self, reason: str) -> None:
+        """Count an answered frame whose image seems to be in another unit or of another kind."""
+        self._last_doubt = reason
+        self.count(DOUBTED)
+
     def answer(self, milliseconds: Mapping[str, float], summary: str = "") -> None:
         """Count an answered frame with the duration of its stages; ``summary`` explains also a lack of bodies."""
         self._last_answer = summary
@@ -81,8 +88,8 @@ class Statistics:
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
         """The diagnostics of a node, and ``more`` that there is to know beside the frames.
 
-        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused, lost or
-        left without a mask since the last status.
+        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused, doubted,
+        lost or left without a mask since the last status.
         """
         with self._lock:
             now = self._clock()
@@ -101,6 +108,8 @@ class Statistics:
             self._stood = now
         elif counts["refused"] > before["refused"]:
             message = f"refused a {self._what}: {last_error.partition(' ')[2]}"
+        elif counts[DOUBTED] > before[DOUBTED]:
+            message = self._last_doubt
         elif since > _SLOW and not recently["answered"]:
             message = f"{len(came)} {self._what}s came within {since:.0f} s, none was answered"
         elif new := lost - known:
@@ -115,6 +124,7 @@ class Statistics:
             **{what: str(counts[what]) for what in ("received", *_OUTCOMES)},
             "in work": str(counts["received"] - sum(counts[what] for what in _OUTCOMES)),
             WITHOUT_MASK: str(counts[WITHOUT_MASK]),
+            DOUBTED: str(counts[DOUBTED]),
             "lost": str(lost.total()),
             **{f"lost of {topic}": str(number) for topic, number in lost.items()},
             "last error": last_error,

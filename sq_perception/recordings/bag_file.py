@@ -13,8 +13,7 @@ Label images on the one topic that is called ``mask/image``, with or without a n
 images with their stamps; they may have been recorded later, and in another order.  Of several such topics none is
 taken, and frames say so.
 
-The camera is that of the sibling topic ``camera_info``, as image_transport pairs them: the message with the image's
-stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
+The camera is that of one topic (:mod:`sq_perception.recordings.bag_camera`): the message with the image's stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
 topic decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
 
 A bag may be damaged or hostile (:mod:`sq_perception.recordings.bag_reader`); pixels are only allocated for data that
@@ -36,10 +35,11 @@ from sq_msgs_py import depth_image
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
-from sq_perception.recordings import publication
+from sq_perception.recordings import bag_camera, publication
+from sq_perception.recordings.bag_camera import raw_topic
 from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, described
 from sq_perception.recordings.camera_file import read_camera_info
-from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
 _MASKS, _RENDERED = "/mask/image", "/rendered_depth"
@@ -71,17 +71,6 @@ def frame_name(path: Path, stamp: Stamp) -> str:
     return f"{path.resolve().name if path.is_dir() else path.stem}_{stamp}"
 
 
-def raw_topic(topic: str) -> str:
-    """The topic that shows the images of a compressedDepth topic as they are; any other topic itself."""
-    return topic.removesuffix(f"/{compressed_depth.TRANSPORT}")
-
-
-def camera_info_topic(topic: str) -> str:
-    """The camera_info topic of an image topic: the one in its name space."""
-    space, slash, _ = raw_topic(topic).rpartition("/")
-    return f"{space}{slash}camera_info"
-
-
 @dataclass(frozen=True)
 class InputOptions:
     """What is read of files, folders and bags, and how.
@@ -100,6 +89,8 @@ class InputOptions:
         Of images and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
     reading
         What is taken of each image; masks are files called as the frames are.
+    camera_info_topic
+        Topic of the camera in bags, where it is not beside the images'.
 
     Raises
     ------
@@ -114,6 +105,7 @@ class InputOptions:
     limit: int | None = None
     distortion: Treatment = "auto"
     reading: Reading = field(default_factory=Reading)
+    camera_info_topic: str | None = None
 
     def __post_init__(self) -> None:
         if self.every < 1 or (self.limit is not None and self.limit < 1):
@@ -153,7 +145,8 @@ class RecordedBag:
         with ExitStack() as opened:
             self._reader = opened.enter_context(closing(BagReader(self._path)))
             self.topic = self._chosen(self._options.topic)
-            self._info_topic = camera_info_topic(self.topic)
+            first = next(self._first_images(self.topic), None)
+            self._info_topic = bag_camera.info_topic(self._reader, self.topic, first, self._options.camera_info_topic)
             others = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
             self._mask_topics = sorted(topic for topic in others if topic.endswith(_MASKS))
             self._masks = opened.enter_context(closing(self._recorded_masks()))
@@ -197,7 +190,7 @@ class RecordedBag:
         waiting: Message | None = None
         connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
         if needs_info:
-            infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic)
+            infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic.name)
             latest = next((message for message in self._reader.messages(infos) if isinstance(message, Message)), None)
             connections += infos
         for message in self._reader.messages(connections, self._options.every, self._options.limit):
@@ -251,13 +244,15 @@ class RecordedBag:
 
     def _encoding(self, topic: str) -> str | None:
         """The encoding of the first readable image of a topic; None where none of the first ones can be read."""
-        for message in islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED):
-            if isinstance(message, FrameError):
-                continue
-            if message.kind == COMPRESSED:
-                return compressed_depth.encoding(message.content.format) or message.content.format
-            return str(message.content.encoding)
-        return None
+        message = next(self._first_images(topic), None)
+        if message is not None and message.kind == COMPRESSED:
+            return compressed_depth.encoding(message.content.format) or str(message.content.format)
+        return None if message is None else str(message.content.encoding)
+
+    def _first_images(self, topic: str) -> Iterator[Message]:
+        """The readable ones of the first images of a topic."""
+        found = islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED)
+        return (message for message in found if isinstance(message, Message))
 
     # frames
 
@@ -314,22 +309,27 @@ class RecordedBag:
             yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {described(error)}")
 
     def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
-        depth, encoding = publication.depth_of(message.content, self._orthographic)
-        name, notes, reading = frame_name(self._path, message.stamp), [], self._options.reading
+        name, reading, warnings = frame_name(self._path, message.stamp), self._options.reading, []
+        known: Any = None if info is None else info.content
+        if self._options.camera_info is not None and not self._orthographic:
+            known = read_camera_info(self._options.camera_info, publication.size_of(message.content), name)
+        unit = getattr(known, "unit", None)
+        found, encoding = publication.depth_of(message.content, self._orthographic, reading.scale, unit)
+        depth, notes = found.depth, found.notes
         labels = self._labels(message.stamp, name, depth)
         if self._orthographic:
             camera = unit_cube.camera(depth.shape[1], depth.shape[0])
         else:
-            if reading.scale is not None:
-                usual = MILLIMETRES if encoding.startswith("16UC1") else 1.0
-                depth = depth * np.float32(usual / reading.scale)
-                encoding = encoding if reading.scale == usual else "32FC1"  # millimetres do not hold other units
-            calibration = self._calibration(info, depth)
+            if known is None:
+                raise ValueError(self._info_topic.absent)
+            calibration = Calibration.of(known, self.topic, self._options.distortion)
             labels = None if labels is None else calibration.rectified_labels(labels)
-            depth, camera = calibration.rectified(depth), calibration.camera
-            notes += [f"{self.topic}: {calibration.note}"] if calibration.note else []
+            camera = calibration.camera
+            depth = reading.z(calibration.rectified(depth), camera)
+            warnings += [f"{self.topic}: {calibration.note}"] if calibration.note else []
+            notes = (*([self._info_topic.note] if info is not None and self._info_topic.note else ()), *notes)
         if len(self._mask_topics) > 1 and reading.masks is None and not reading.ignore_masks:
-            notes.append(f"several topics with masks, none is taken: {', '.join(self._mask_topics)}")
+            warnings.append(f"several topics with masks, none is taken: {', '.join(self._mask_topics)}")
         return reading.of(
             RecordedFrame(
                 depth,
@@ -339,16 +339,9 @@ class RecordedBag:
                 stamp=message.stamp,
                 topic=self.topic,
                 frame_id=message.content.header.frame_id,
-                warning="; ".join(f"{self._path}: {note}" for note in notes),
+                warning="; ".join(f"{self._path}: {text}" for text in warnings),
+                notes="; ".join(notes),
                 encoding=encoding,
                 received=message.received,
             )
         )
-
-    def _calibration(self, info: Message | None, depth: np.ndarray) -> Calibration:
-        known: Any = None if info is None else info.content
-        if self._options.camera_info is not None:
-            known = read_camera_info(self._options.camera_info, (depth.shape[1], depth.shape[0]))
-        if known is None:
-            raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
-        return Calibration.of(known, self.topic, self._options.distortion)

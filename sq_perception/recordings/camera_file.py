@@ -1,46 +1,90 @@
 """The camera of recorded images: a camera_info YAML, or intrinsics as other tools write them.
 
-| form | from |
-| --- | --- |
-| YAML | camera_calibration, or a printed camera_info message |
-| ``525,525,319.5,239.5`` | papers and data sets: fx, fy, cx, cy in pixels, of an image without distortion |
-| JSON with ``ppx``, ``ppy`` | librealsense (``rs-enumerate-devices``, ``rs2_intrinsics``) |
-| JSON with ``intrinsic_matrix`` | Open3D: nine numbers, COLUMN by column |
-| JSON or YAML with ``fx``, ``fy``, ``cx``, ``cy``, or ``cam_K`` | BOP's camera.json, and many programs |
-| 3 x 3 numbers, row by row: text, NPY | ``cam_K.txt`` of FoundationPose, ``intrinsics.txt``, NumPy's savetxt |
+Whatever the format (:mod:`sq_perception.recordings.camera_document`), K is looked for by its usual names: in one number
+each (fx, fl_x, Camera.fx ...; cx, ppx ...), in four (``intrinsics`` of Kalibr), or in a matrix (K, cam_K, camera_matrix,
+intrinsic_matrix ...), row by row or, as the last row of K shows, column by column.  That reads camera_calibration's
+YAML and printed camera_info messages, OpenCV's FileStorage, librealsense, Open3D, BOP (camera.json, and scene_camera.json
+by the number of the image), Kalibr, NeRF's transforms.json, COLMAP, ORB-SLAM, ScanNet, Record3D, ``.intr`` and texts.
+Of several cameras the one of the image's size counts, and depth before colour.  Beside files, ``525,525,319.5,239.5`` is
+fx, fy, cx, cy.
 
-Forms without a size are of the images' size.
+Where no size is stated, it is the image's.  A stated unit of depths (depth_scale, DepthMapFactor ...) comes along.
 
 A pixel's centre has integer coordinates, in all of them.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import reprlib
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sq_perception.files import plain_yaml
-from sq_perception.files.unpacking import UnpackingError, npy_array
+from sq_perception.imaging import depth_units
 from sq_perception.imaging.calibration import Calibration, Treatment
+from sq_perception.imaging.depth_units import Stated
+from sq_perception.recordings import camera_document
 
-LARGEST = 2**20
-"""Bytes of a file."""
-_LONGEST = 2**12
-"""Bytes of a file that holds nothing but a matrix."""
 _SKEW = 1e-6
 """Skew as a share of fx; no depth camera in use has any."""
-_WIDTH, _HEIGHT = ("image_width", "width"), ("image_height", "height")
-_MATRIX, _PROJECTION = ("camera_matrix", "k", "K", "cam_K"), ("projection_matrix", "p", "P")
-_NO_DISTORTION = ("none", "")
-_BROWN_CONRADY = ("brown conrady", "inverse brown conrady", "modified brown conrady")
-"""Names of librealsense.  Of depth images the coefficients are zero; others are taken for plumb_bob's."""
+_MOST_NODES = 10_000
+"""Mappings and lists of a document that are looked at; a scene of BOP has 3 for each of a thousand images."""
+CAMERA_FILES = (
+    "camera_info.yaml",
+    "camera_info.yml",
+    "scene_camera.json",  # BOP's, of each image; camera.json of all
+    "camera.yaml",
+    "camera.yml",
+    "camera.json",
+    "intrinsics.json",
+    "camera_intrinsic.json",  # Open3D's
+    "intrinsics.txt",
+    "cam_K.txt",
+    "transforms.json",
+)
+"""Names of the camera beside images."""
+
+_FX, _FY, _CX, _CY = "fx", "fy", "cx", "cy"
+_MATRIX, _PROJECTION, _WIDTH, _HEIGHT, _SIZE = "matrix", "projection matrix", "width", "height", "size"
+_COEFFICIENTS, _LENS, _MODEL, _UNIT = "distortion", "distortion model", "model", "unit"
+_NAMES = {
+    **dict.fromkeys(("fx", "fl x", "f x", "focal x", "focal length x", "fu"), _FX),
+    **dict.fromkeys(("fy", "fl y", "f y", "focal y", "focal length y", "fv"), _FY),
+    **dict.fromkeys(("cx", "c x", "ppx", "center x", "principal point x"), _CX),
+    **dict.fromkeys(("cy", "c y", "ppy", "center y", "principal point y"), _CY),
+    **dict.fromkeys(("f", "focal", "focal length"), "f"),
+    **dict.fromkeys(("pp", "principal point"), "pp"),
+    **dict.fromkeys(("matrix", "k", "intrinsic", "intrinsics", "intrinsic matrix", "intrinsics matrix", "mtx"), _MATRIX),
+    **dict.fromkeys(("projection matrix", "p"), _PROJECTION),
+    **dict.fromkeys(("width", "w"), _WIDTH),
+    **dict.fromkeys(("height", "h"), _HEIGHT),
+    **dict.fromkeys(("resolution", "size"), _SIZE),
+    **dict.fromkeys(("distortion coefficients", "distortion coeffs", "distortion", "d", "coeffs", "dist coeffs", "dist coefs",
+                     "dist"),
+                    _COEFFICIENTS),
+    "distortion model": _LENS,
+    "model": _MODEL,
+    **dict.fromkeys(("scale", "map factor", "factor", "shift", "unit scale factor", "unit", "units"), _UNIT),
+    **{name: name for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "roi", "binning x", "binning y")},
+}  # fmt: skip
+"""What a name means, without the words that say of what it is."""
+_WORDS = re.compile(r"[A-Z]?[a-z]+\d*|[A-Z]+(?![a-z])\d*|\d+")
+_OF_WHAT = ("m", "camera", "cam", "image", "img", "calibration", "rgbd", "integer", "ir")
+_COLOUR = ("color", "colour", "rgb")
+_LENSES = {
+    **dict.fromkeys(("", "none", "pinhole", "simple pinhole", "plumb bob", "radtan", "opencv", "simple radial", "radial",
+                     "perspective", "brown conrady", "inverse brown conrady", "modified brown conrady"), "plumb_bob"),
+    **dict.fromkeys(("rational polynomial", "full opencv"), "rational_polynomial"),
+    **dict.fromkeys(("equidistant", "equi", "fisheye", "opencv fisheye", "kannala brandt", "kannala brandt4",
+                     "kannala brandt8"), "equidistant"),
+}  # fmt: skip
+"""Distortion models by their names.  Depth images of librealsense have coefficients of zero; others are taken for
+plumb_bob's."""
 
 
 class FrameError(ValueError):
@@ -59,7 +103,7 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat."""
+    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat.  ``unit`` is that of depths, if stated."""
 
     width: int
     height: int
@@ -67,9 +111,10 @@ class CameraInfo:
     d: tuple[float, ...]
     k: tuple[float, ...]
     p: tuple[float, ...]
-    binning_x: int
-    binning_y: int
-    roi: Region
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: Region = Region()
+    unit: Stated | None = None
 
 
 def read_calibration(
@@ -82,178 +127,283 @@ def read_calibration(
     FrameError
         As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
     """
-    info = read_camera_info(source, size)
+    return calibration(read_camera_info(source, size), source, distortion, name)
+
+
+def calibration(info: CameraInfo, source: str | Path, distortion: Treatment, name: str) -> Calibration:
+    """The calibration of images called ``name``; a FrameError names the ``source`` of the camera_info."""
     try:
         return Calibration.of(info, name, distortion)
     except ValueError as error:
         raise FrameError(f"{source}: {error}") from error
 
 
-def read_camera_info(source: str | Path, size: tuple[int, int] | None = None) -> CameraInfo:
-    """A YAML file in the layout of camera_calibration, or of a printed camera_info message; or JSON, see the module.
+def read_camera_info(source: str | Path, size: tuple[int, int] | None = None, name: str | None = None) -> CameraInfo:
+    """The camera of a file, or of four numbers; see the module.
 
-    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.  Where the
-    ``size`` of the images is given, width and height, four numbers do for a file.
+    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
+
+    Parameters
+    ----------
+    source
+    size
+        Width and height of the images, where nothing states them.
+    name
+        Of the image without suffix: its number tells which of a scene's cameras it has.  None: any image's will do.
 
     Raises
     ------
     FrameError
     """
     try:
-        four = None if size is None or os.path.exists(source) else _four_numbers(str(source))
-        return _camera_info(_mapping(Path(source)) if four is None else four, size)
-    except (plain_yaml.YamlError, FrameError) as error:
+        if not os.path.exists(source) and (numbers := _numbers(str(source))) is not None:
+            if len(numbers) != 4:
+                raise FrameError(f"expected four numbers, fx,fy,cx,cy, got {len(numbers)}")
+            document: Any = dict(zip((_FX, _FY, _CX, _CY), numbers, strict=True))
+        else:
+            document = camera_document.read(Path(source))
+        found = _chosen(document, size, name)
+        if found.unit is None:
+            return found
+        return replace(found, unit=replace(found.unit, source=f"{Path(source).name}: {found.unit.source}"))
+    except ValueError as error:
         raise FrameError(f"{source}: cannot read the camera_info: {error}") from error
 
 
-def _camera_info(info: Any, size: tuple[int, int] | None) -> CameraInfo:
-    if not isinstance(info, dict):
-        raise FrameError("expected a camera_info as a YAML mapping, or 3 x 3 numbers")
-    if info.keys() >= {"fx", "fy", "cx", "cy"}:
-        info = {**info, "k": [info["fx"], 0, info["cx"], 0, info["fy"], info["cy"], 0, 0, 1]}
-    has_matrix = bool(info.keys() & {*_MATRIX, *_PROJECTION})
-    if size is not None and has_matrix and not info.keys() & {*_WIDTH, *_HEIGHT}:
-        info = {**info, "width": size[0], "height": size[1]}
-    width, height = _size(info, _WIDTH), _size(info, _HEIGHT)
-    matrix = _matrix(info, _MATRIX, 9)
-    distortion = _matrix(info, ("distortion_coefficients", "d", "D"), None)
-    projection = _matrix(info, _PROJECTION, 12)
-    if not has_matrix:
-        raise FrameError("expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
-    if matrix[6:8].any() and not matrix[[2, 5]].any():
-        raise FrameError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
-    if abs(matrix[1]) > _SKEW * abs(matrix[0]):
-        raise FrameError(f"camera matrix: expected no skew, got {matrix[1]:g}")
-    region = info.get("roi", {})
+def camera_beside(path: Path) -> Path | None:
+    """The camera of an image: a file of its folder, of its name, or, of a folder of depth images, in the one above."""
+    beside = path.with_suffix(".yaml")  # as sq-perception render writes it
+    if found := camera_in(path.parent) or (beside if beside.is_file() else None):
+        return found
+    folder = path.absolute().parent
+    return camera_in(folder.parent) if "depth" in folder.name.lower() else None
+
+
+def camera_in(folder: Path) -> Path | None:
+    """The camera of a folder's images."""
+    return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def _numbers(text: str) -> list[float] | None:
+    """The numbers of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
+    try:
+        return [float(word) for word in text.split(",")] if "," in text else None
+    except ValueError:
+        return None
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A camera of a document: the names on the way to it, and its fields, each with its name in the file."""
+
+    way: tuple[str, ...]
+    fields: Mapping[str, tuple[str, Any]]
+    is_colour: bool
+    is_depth: bool
+
+    def get(self, field: str) -> Any:
+        return self.fields[field][1] if field in self.fields else None
+
+
+def _chosen(document: Any, size: tuple[int, int] | None, name: str | None) -> CameraInfo:
+    """The camera of a document that is meant: of the image's number and size, and of depth."""
+    if not isinstance(document, dict | list):
+        raise FrameError("expected a camera_info as a YAML mapping, JSON, or 3 x 3 numbers")
+    found = list(_cameras(document))
+    whole = [one for one in found if _has_camera(one)]
+    if not whole:
+        raise FrameError(_what_is_missing(found))
+    if isinstance(document, dict) and all(str(key).isdigit() for key in document):
+        if name is None:
+            whole = whole[:1]
+        elif len({_camera_info(one, size) for one in whole}) > 1:
+            whole = [one for one in whole if name.isdigit() and int(one.way[0]) == int(name)]
+            if not whole:
+                raise FrameError(f"no camera for image {name} among those of {len(document)} images")
+    for is_wanted in (
+        lambda one: size is None or _sides(one, None) in (None, size),
+        lambda one: one.is_depth,
+        lambda one: not one.is_colour,
+    ):
+        whole = [one for one in whole if is_wanted(one)] or whole
+    first, *others = {_camera_info(one, size) for one in whole}
+    if others:
+        names = ", ".join(" ".join(one.way) for one in whole[:8])
+        raise FrameError(f"expected one camera, got {len(whole)}: {names}: write the one of the images by itself")
+    return first
+
+
+def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None) -> Iterator[_Found]:
+    """Everything in a document that has a field of a camera."""
+    left = [_MOST_NODES] if left is None else left
+    left[0] -= 1
+    if left[0] < 0:
+        return
+    if isinstance(node, dict):
+        groups: dict[str, dict[str, tuple[str, Any]]] = {"": {}, "depth": {}, "colour": {}}
+        for name, value in node.items():
+            words = [word.lower() for word in _WORDS.findall(str(name))]
+            group = "depth" if "depth" in words else "colour" if any(word in _COLOUR for word in words) else ""
+            words = [word for word in words if word.rstrip("0123456789") not in (*_OF_WHAT, *_COLOUR, "depth")]
+            field = _NAMES.get(" ".join(words))
+            field = _LENS if field == _COEFFICIENTS and isinstance(value, str) else field
+            if field is not None and (field != _UNIT or group == "depth" or "map" in words):
+                groups[group].setdefault(field, (str(name), value))
+        of_way = {word.lower() for part in way for word in _WORDS.findall(part)}
+        is_colour, is_depth = not of_way.isdisjoint(_COLOUR), "depth" in of_way
+        if any(_has_camera(_Found(way, groups[name], False, False)) for name in ("depth", "colour")):
+            for group in ("depth", "colour"):
+                fields = {**groups[""], **groups[group], **{k: v for k, v in groups["depth"].items() if k == _UNIT}}
+                yield _Found((*way, group), fields, group == "colour", group == "depth")
+        elif fields := {**groups["colour"], **groups[""], **groups["depth"]}:
+            yield _Found(way, fields, is_colour, is_depth)
+    inner = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, value in inner:
+        if isinstance(value, dict | list):
+            yield from _cameras(value, (*way, str(key)), left)
+
+
+def _has_camera(one: _Found) -> bool:
+    fields = one.fields
+    return (
+        _is_matrix(one.get(_MATRIX))
+        or _is_matrix(one.get(_PROJECTION))
+        or ((fields.keys() >= {_FX, _FY} or "f" in fields) and (fields.keys() >= {_CX, _CY} or "pp" in fields))
+    )
+
+
+def _is_matrix(value: Any) -> bool:
+    return isinstance(value, list | dict) and bool(value)
+
+
+def _what_is_missing(found: list[_Found]) -> str:
+    best = max(found, key=lambda one: len(one.fields.keys() & {_FX, _FY, _CX, _CY}), default=None)
+    has = [] if best is None else [name for name in (_FX, _FY, _CX, _CY) if name in best.fields]
+    if has:
+        missing = [name for name in (_FX, _FY, _CX, _CY) if name not in has]
+        return f"expected {', '.join(missing)} (or other names for them) beside {', '.join(has)}"
+    return "expected fx, fy, cx, cy, or a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12"
+
+
+def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
+    width, height = _sides(one, size) or (0, 0)
+    if not width or not height:
+        raise FrameError("expected image_width and image_height (or width and height)")
+    projection = _numbers_of(one, _PROJECTION, (12,)) if _is_matrix(one.get(_PROJECTION)) else np.zeros(12)
+    matrix = _matrix(one)
+    lens = _lens(one)
+    coefficients = _numbers_of(one, _COEFFICIENTS, None)
+    if not coefficients.size and (lens == "equidistant" or "k1" in one.fields):
+        order = "k1 k2 k3 k4" if lens == "equidistant" else "k1 k2 p1 p2 k3 k4 k5 k6"
+        coefficients = np.array([_number(one, name) for name in order.split()])
+    name, unit = one.fields.get(_UNIT, ("", None))
+    if isinstance(unit, list) and len(unit) == 1:
+        unit = unit[0]
+    is_unit = isinstance(unit, int | float) and not isinstance(unit, bool)
+    region = one.get("roi") or {}
     if not isinstance(region, dict):
         raise FrameError(f"roi: expected a mapping, got {reprlib.repr(region)}")
     return CameraInfo(
         width,
         height,
-        str(info.get("distortion_model", info.get("camera_model", "plumb_bob"))),
-        tuple(distortion.tolist()),
+        lens,
+        tuple(coefficients.tolist()),
         tuple(matrix.tolist()),
         tuple(projection.tolist()),
-        _count(info, "binning_x"),
-        _count(info, "binning_y"),
-        Region(*(_count(region, name) for name in ("x_offset", "y_offset", "width", "height"))),
+        _count(one.get("binning x"), "binning_x"),
+        _count(one.get("binning y"), "binning_y"),
+        Region(*(_count(region.get(part), part) for part in ("x_offset", "y_offset", "width", "height"))),
+        depth_units.stated(float(unit), name) if is_unit else None,
     )
 
 
-def _mapping(path: Path) -> Any:
-    """What a file holds, by the names of a camera_info; a mapping if it is one of the forms that are known."""
-    if (rows := _rows(path)) is not None:
-        return {"k": rows}
-    if path.suffix.lower() == ".json":
-        return _read_json(path)
-    return next((entry for entry in plain_yaml.read_all(path) if entry is not None), None)
-
-
-def _rows(path: Path) -> list[float] | None:
-    """The nine numbers of a file that holds nothing but a matrix, 3 x 3, or a larger one around it; else None."""
-    if path.suffix.lower() == ".npy":
-        try:
-            matrix = npy_array(path)
-        except UnpackingError as error:
-            raise FrameError(str(error)) from error
+def _sides(one: _Found, size: tuple[int, int] | None) -> tuple[int, int] | None:
+    """Width and height of a camera's images; ``size`` where they are not stated."""
+    given = one.get(_SIZE)
+    if isinstance(given, list) and len(given) == 2:
+        width, height = given
+    elif _WIDTH not in one.fields and _HEIGHT not in one.fields:
+        return size
     else:
-        try:
-            with path.open("rb") as file:
-                words = re.split(r"[\s,;\[\]]+", file.read(_LONGEST + 1).decode("ascii"))
-            matrix = np.array([float(word) for word in words if word])
-        except (OSError, ValueError):
-            return None
-        shape = {9: (3, 3), 12: (3, 4), 16: (4, 4)}.get(matrix.size)
-        if shape is None:
-            return None
-        matrix = matrix.reshape(shape)
-    if matrix.shape not in ((3, 3), (3, 4), (4, 4)) or matrix.dtype.kind not in "fiu":
-        raise FrameError(f"expected 3 x 3 numbers, got {matrix.dtype} {matrix.shape}")
-    return [float(number) for number in matrix[:3, :3].ravel()]
+        if _WIDTH not in one.fields or _HEIGHT not in one.fields:
+            raise FrameError("expected both image_width and image_height (or width and height)")
+        width, height = one.get(_WIDTH), one.get(_HEIGHT)
+    sides = []
+    for name, value in ((_WIDTH, width), (_HEIGHT, height)):
+        value = int(value) if isinstance(value, float) and value.is_integer() else value
+        side = _count(value, name)
+        if side < 1:
+            raise FrameError(f"{name}: expected a positive integer, got {value!r}")
+        sides.append(side)
+    return sides[0], sides[1]
 
 
-def _four_numbers(text: str) -> dict[str, float] | None:
-    """fx, fy, cx, cy of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
+def _matrix(one: _Found) -> np.ndarray:
+    """K, flat, row by row; zeros where only a projection matrix is given."""
+    fields = one.fields
+    if fields.keys() >= {_CX, _CY} and (fields.keys() >= {_FX, _FY} or "f" in fields):
+        fx, fy = (_number(one, name if name in fields else "f") for name in (_FX, _FY))
+        return np.array([fx, 0, _number(one, _CX), 0, fy, _number(one, _CY), 0, 0, 1])
+    if "pp" in fields and "f" in fields:
+        (fx, fy), (cx, cy) = np.broadcast_to(_numbers_of(one, "f", (1, 2)), 2), _numbers_of(one, "pp", (2,))
+        return np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+    if not _is_matrix(one.get(_MATRIX)):
+        return np.zeros(9)
+    numbers = _numbers_of(one, _MATRIX, (4, 9, 12, 16))
+    if numbers.size == 4:
+        fx, fy, cx, cy = numbers
+        return np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+    name = fields[_MATRIX][0]
+    matrix = numbers.reshape(-1, 3 if numbers.size == 9 else 4)
+    if matrix[2, :2].any() and not matrix[:2, 2].any() and numbers.size != 12:  # column by column
+        matrix = matrix.T
+    matrix = matrix[:3, :3]
+    if abs(matrix[0, 1]) > _SKEW * abs(matrix[0, 0]):
+        raise FrameError(f"{name}: expected no skew, got {matrix[0, 1]:g}")
+    if matrix.any() and not np.allclose(matrix[2], [0, 0, 1]):
+        raise FrameError(f"{name}: expected 0 0 1 in its last row, got {matrix[2].tolist()}")
+    return matrix.ravel()
+
+
+def _lens(one: _Found) -> str:
+    """The distortion model of a camera, by the name that messages have for it."""
+    for field in (_LENS, _MODEL):
+        given = one.get(field)
+        if given is None:
+            continue
+        words = [word.lower() for word in _WORDS.findall(str(given))]
+        known = _LENSES.get(" ".join(word for word in words if word != "distortion"))
+        if known is not None and known != "plumb_bob":
+            return known
+        if known is None and field == _LENS:
+            return str(given)  # which Calibration refuses where there is a distortion
+        if "theta" in words:
+            raise FrameError(f"{one.fields[field][0]}: expected {', '.join(set(_LENSES.values()))}, got {given!r}")
+    return "plumb_bob"
+
+
+def _number(one: _Found, field: str) -> float:
+    return float(_numbers_of(one, field, (1,))[0]) if field in one.fields else 0.0
+
+
+def _numbers_of(one: _Found, field: str, lengths: tuple[int, ...] | None) -> np.ndarray:
+    """The finite numbers of a field, flat; none where it is not there."""
+    if field not in one.fields:
+        return np.zeros(0)
+    name, values = one.fields[field]
+    values = values.get("data") if isinstance(values, dict) else values
     try:
-        return dict(zip(("fx", "fy", "cx", "cy"), map(float, text.split(",")), strict=True))
-    except ValueError:
-        return None
+        numbers = np.array([] if values is None else values, dtype=float).ravel()
+    except (TypeError, ValueError, OverflowError) as error:  # the last of whole numbers that no float holds
+        raise FrameError(f"{name}: expected numbers, got {reprlib.repr(values)}") from error
+    if not np.isfinite(numbers).all() or (lengths is not None and numbers.size not in lengths):
+        wanted = "finite numbers" if lengths is None else f"{' or '.join(map(str, lengths))} finite numbers"
+        raise FrameError(f"{name}: expected {wanted}, got {reprlib.repr(values)}")
+    return numbers
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    """The mapping of a file.
-
-    Raises
-    ------
-    FrameError
-        If it is missing, too large, no JSON, or of another form.
-    """
-    try:
-        with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
-        found = json.loads(data)
-    except (OSError, ValueError, RecursionError) as error:
-        raise FrameError(f"not JSON: {error}") from error
-    if len(data) > LARGEST:
-        raise FrameError(f"expected at most {LARGEST} bytes")
-    if not isinstance(found, dict):
-        raise FrameError("expected a JSON object with intrinsics")
-    if "ppx" in found and "ppy" in found:
-        return _of_librealsense(found)
-    if "intrinsic_matrix" in found:
-        return _of_open3d(found)
-    return found
-
-
-def _of_librealsense(found: dict[str, Any]) -> dict[str, Any]:
-    missing = [name for name in ("width", "height", "fx", "fy") if name not in found]
-    if missing:
-        raise FrameError(f"expected {', '.join(missing)} beside ppx and ppy")
-    model = str(found.get("model", "")).lower().replace("_", " ").removeprefix("distortion.")
-    if model not in _NO_DISTORTION + _BROWN_CONRADY:
-        raise FrameError(f"model: expected Brown Conrady or none, got {found['model']!r}")
-    distortion = found.get("coeffs", []) if model in _BROWN_CONRADY else []
-    return {**found, "cx": found["ppx"], "cy": found["ppy"], "d": distortion}
-
-
-def _of_open3d(found: dict[str, Any]) -> dict[str, Any]:
-    columns = found["intrinsic_matrix"]
-    if not isinstance(columns, list) or len(columns) != 9:
-        raise FrameError("intrinsic_matrix: expected 9 numbers, column by column")
-    rows = [columns[3 * column + row] for row in range(3) for column in range(3)]
-    return {"width": found.get("width"), "height": found.get("height"), "k": rows}
-
-
-def _size(info: dict[Any, Any], names: tuple[str, ...]) -> int:
-    name = next((name for name in names if name in info), None)
-    if name is None:
-        raise FrameError(f"expected {names[0]} (or {names[1]})")
-    value = _count(info, name)
-    if value < 1:
-        raise FrameError(f"{name}: expected a positive integer, got {value!r}")
-    return value
-
-
-def _count(info: dict[Any, Any], name: str) -> int:
-    value = info.get(name, 0)
+def _count(value: Any, name: str) -> int:
+    value = 0 if value is None else value
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise FrameError(f"{name}: expected a positive integer or 0, got {value!r}")
     return value
-
-
-def _matrix(info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray:
-    """The numbers of the first of the names that is there; zeros, or none, where none is."""
-    for name in names:
-        if name not in info:
-            continue
-        entry = info[name]
-        values = entry.get("data") if isinstance(entry, dict) else entry
-        try:
-            numbers = np.array(values, dtype=float).ravel()
-        except (TypeError, ValueError, OverflowError) as error:  # the last of whole numbers that no float holds
-            raise FrameError(f"{name}: expected numbers, got {reprlib.repr(values)}") from error
-        if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
-            wanted = "finite numbers" if length is None else f"{length} finite numbers"
-            raise FrameError(f"{name}: expected {wanted}, got {reprlib.repr(values)}")
-        return numbers
-    return np.zeros(length or 0)

@@ -2,17 +2,17 @@
 
 | file | needs | depth |
 | --- | --- | --- |
-| ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
-| ``.npy``, ``.tif`` of floats, ``.exr`` | a camera_info | metres, NaN or 0 = nothing; rectified where it is raw |
-| 16 bit ``.png``, ``.tif``, ``.npy`` | a camera_info | millimetres, 0 = nothing; likewise |
+| ``.npz`` | ``depth`` (h, w), ``K`` (3, 3) | floats: metres; whole numbers: millimetres, or by ``depth_scale`` |
+| ``.npy``, ``.tif`` of floats, ``.exr`` | a camera_info | metres; rectified where it is raw |
+| ``.png``, ``.tif``, ``.npy`` of whole numbers | a camera_info | millimetres, or as it states; likewise |
 | ``.pcd``, ``.ply`` | nothing | points in metres, see :mod:`sq_perception.recordings.cloud_file` |
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
 | ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
-A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.  Names of exactly this form are
-those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre: they are read so, with a warning, unless the scale
-is given.  ``Reading.scale`` goes before all of these units.  A camera_info is a YAML, or one of the forms of
-:mod:`sq_perception.recordings.camera_file`.
+What is no reading, and which units count, :mod:`sq_perception.imaging.depth_units` decides; ``Reading.scale`` goes
+before all others.  A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.  Names of
+exactly this form are those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre.  A camera_info is a YAML, or
+one of the forms of :mod:`sq_perception.recordings.camera_file`; where none is named, the one beside the image counts.
 
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w)
 and the text "orthographic" as ``projection``, which goes before the caller's.  Nothing in a file is executed: no
@@ -34,17 +34,16 @@ from typing import NamedTuple, get_args
 import numpy as np
 
 from sq_perception.files.unpacking import UnpackingError, exr_image, grey_image, npy_array, npz_arrays
-from sq_perception.imaging import unit_cube
+from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Treatment
-from sq_perception.imaging.camera import GREATEST_MEDIAN, LEAST_MEDIAN, Camera, Projection
+from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.imaging.depth_units import MILLIMETRES, DepthKind, Metres, Stated
 from sq_perception.recordings import cloud_file
-from sq_perception.recordings.camera_file import FrameError, read_calibration
+from sq_perception.recordings.camera_file import FrameError, calibration, camera_beside, read_camera_info
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
-MILLIMETRES = 1000.0
-"""Units a metre."""
-TUM_SCALE = 5000.0
-"""Units a metre in the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
+TUM = Stated(5000.0, "the name is one of the TUM RGB-D benchmark")
+"""https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 _TUM_NAME = re.compile(r"\d{10}\.\d{6}")
 _TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
 
@@ -78,6 +77,8 @@ class RecordedFrame:
         Where it was published, and the name of its optical frame; empty for files.
     warning : str
         What should be known about the frame before its results are believed; empty if nothing.
+    notes : str
+        What was found out about its numbers: units, marks of nothing measured; likewise.
     encoding : str
         Of the depth where it came from, as messages name it (16UC1, 32FC1, mono8, mono16); empty where it has none.
     received : int or None
@@ -94,6 +95,7 @@ class RecordedFrame:
     topic: str = ""
     frame_id: str = ""
     warning: str = ""
+    notes: str = ""
     encoding: str = ""
     received: int | None = None
     has_free_space: bool = True
@@ -111,7 +113,7 @@ class Reading:
     Attributes
     ----------
     scale : float or None
-        Units a metre; None: 1000 for whole numbers, or as the file's name has it, and 1 for floats.
+        Units a metre; None: as a file states them, else 1000 for whole numbers and 1 for floats.
     nearest, farthest : float
         Readings beyond, metres, are none.
     region : (4,) of int or None
@@ -120,11 +122,13 @@ class Reading:
         A folder with a label image for each frame, of its name and ``.png``: 0 is background.
     ignore_masks : bool
         Whether no labels are read, wherever they are.
+    kind : str
+        "z", or "range" for images of distances to the camera's centre.
 
     Raises
     ------
     ValueError
-        For a scale or depth that is not positive, limits that leave nothing, or an empty region.
+        For a scale or depth that is not positive, limits that leave nothing, an empty region, or another kind.
     """
 
     scale: float | None = None
@@ -133,14 +137,21 @@ class Reading:
     region: tuple[int, int, int, int] | None = None
     masks: Path | None = None
     ignore_masks: bool = False
+    kind: DepthKind = "z"
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 0 < self.scale < math.inf:
             raise ValueError(f"scale: expected a positive number of units a metre, got {self.scale:g}")
+        if self.kind not in get_args(DepthKind):
+            raise ValueError(f"kind: expected {' or '.join(get_args(DepthKind))}, got {self.kind!r}")
         if not 0 <= self.nearest < self.farthest:
             raise ValueError(f"depths: expected 0 <= nearest < farthest, got {self.nearest:g} and {self.farthest:g}")
         if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 1):
             raise ValueError(f"region: expected left, top >= 0 and width, height >= 1, got {self.region}")
+
+    def z(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """Depth along the optical axis of a rectified image of this kind."""
+        return depth_units.z_from_range(depth, camera) if self.kind == "range" else depth
 
     def labels(self, name: str, like: np.ndarray) -> np.ndarray | None:
         """The label image (height, width) of a frame, int32; None without a folder of them.
@@ -204,7 +215,7 @@ def read(
         See the table above.
     camera_info
         Intrinsics of an image: YAML as camera_calibration writes it or as a camera_info message prints, or another
-        form of :mod:`sq_perception.recordings.camera_file`.
+        form of :mod:`sq_perception.recordings.camera_file`; None: what lies beside the image.
     projection
         "pinhole" or "orthographic".
     distortion
@@ -247,6 +258,8 @@ def _read(
         return frame if labels is None else replace(frame, labels=labels)
     if suffix in cloud_file.SUFFIXES:
         return _read_cloud(path, reading)
+    if suffix == ".bag":
+        raise ValueError(f"a bag of ROS 1: convert it with: rosbags-convert --src {path} --dst {path.stem}")
     if suffix not in SUFFIXES:
         raise ValueError(f"expected a name that ends in {', '.join(SUFFIXES)}")
     image = _image(path)
@@ -272,34 +285,33 @@ def _of_pinhole(
     path: Path, image: np.ndarray, camera_info: str | Path | None, distortion: Treatment, reading: Reading
 ) -> RecordedFrame:
     """The frame of a pinhole camera's image, which is rectified."""
-    is_metric = image.dtype.kind == "f"
-    if not is_metric and image.dtype != np.uint16:
+    camera_info = camera_info or camera_beside(path)
+    if camera_info is None:
+        raise ValueError("a depth image needs a camera_info with the camera's intrinsics, a file or fx,fy,cx,cy")
+    info = read_camera_info(camera_info, (image.shape[1], image.shape[0]), path.stem)
+    known = info.unit or (TUM if path.suffix.lower() == ".png" and _TUM_NAME.fullmatch(path.stem) else None)
+    found = _metres(image, reading, known)
+    way = calibration(info, camera_info, distortion, path.absolute().with_suffix("").as_posix())
+    warnings = [f"{camera_info}: {way.note}"] * bool(way.note)
+    camera = way.camera
+    if not (-1 < camera.cx < camera.width and -1 < camera.cy < camera.height):
+        middle, shape = f"{camera.cx:g}, {camera.cy:g}", f"{camera.width} x {camera.height}"
+        warnings.append(f"{camera_info}: the middle {middle} is beside an image of {shape}: another resolution's?")
+    depth, labels = reading.z(way.rectified(found.depth), camera), reading.labels(path.stem, image)
+    labels = None if labels is None else way.rectified_labels(labels)
+    encoding = "16UC1" if found.scale == MILLIMETRES and image.dtype == np.uint16 and reading.kind == "z" else "32FC1"
+    return RecordedFrame(
+        depth, camera, labels, path.name, warning="; ".join(warnings), notes="; ".join(found.notes), encoding=encoding
+    )
+
+
+def _metres(image: np.ndarray, reading: Reading, known: Stated | None) -> Metres:
+    if image.dtype.kind not in "fiu" or (image.dtype.itemsize == 1 and reading.scale is None and known is None):
         raise ValueError(
             f"a pinhole depth image has 16 bit (millimetres) or floats (metres), this one {image.dtype}; "
             "for grey images of the thesis' kind choose the orthographic projection"
         )
-    if camera_info is None:
-        raise ValueError("a depth image needs a camera_info with the camera's intrinsics, a file or fx,fy,cx,cy")
-    size = image.shape[1], image.shape[0]
-    calibration = read_calibration(camera_info, distortion, path.absolute().with_suffix("").as_posix(), size)
-    scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
-    if reading.scale is not None:
-        scale = reading.scale
-    elif path.suffix.lower() == ".png" and _TUM_NAME.fullmatch(path.stem):
-        scale = TUM_SCALE
-        warnings.append(
-            f"{path.parent}: names as in the TUM RGB-D benchmark, so {TUM_SCALE:g} units are a metre; "
-            f"depth scale = {MILLIMETRES:g} takes them for millimetres"
-        )
-    camera = calibration.camera
-    if not (-1 < camera.cx < camera.width and -1 < camera.cy < camera.height):
-        middle, shape = f"{camera.cx:g}, {camera.cy:g}", f"{camera.width} x {camera.height}"
-        warnings.append(f"{camera_info}: the middle {middle} is beside an image of {shape}: another resolution's?")
-    depth, labels = calibration.rectified(_metres(image, scale)), reading.labels(path.stem, image)
-    labels = None if labels is None else calibration.rectified_labels(labels)
-    encoding = "16UC1" if scale == MILLIMETRES and not is_metric else "32FC1"
-    warning = "; ".join(warnings)
-    return RecordedFrame(depth, camera, labels, path.name, warning=warning, encoding=encoding)
+    return depth_units.metres(image, reading.scale, known)
 
 
 def stamp_of(path: Path) -> Stamp | None:
@@ -310,6 +322,8 @@ def stamp_of(path: Path) -> Stamp | None:
 
 def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
     depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
+    if reading.kind != "z":
+        raise ValueError("a cloud has points, and no distances in place of z")
     if reading.masks is not None and not is_image:
         raise ValueError("a cloud that is no image has no pixels that a mask could be of")
     labels = reading.labels(path.stem, depth)
@@ -319,28 +333,21 @@ def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
 
 def _likely_mistake(frame: RecordedFrame) -> str:
     """What an image that no depth camera takes seems to be; empty for others."""
+    if not frame.is_cube:
+        return depth_units.wrong_unit(frame.depth)
     shown = frame.depth[::4, ::4]
-    shown = shown[np.isfinite(shown)]
-    if not shown.size:
-        return ""
-    if frame.is_cube:
-        is_within = shown.min() > -1.0 and shown.max() < 2.0
-        return "" if is_within else "depths far outside of the unit cube: a metric image is not orthographic"
-    if np.median(shown) > GREATEST_MEDIAN:
-        return f"half of the image is farther than {GREATEST_MEDIAN:g} m: for millimetres the depth scale is 1000"
-    if np.median(shown) < LEAST_MEDIAN:
-        return f"half of the image is nearer than {LEAST_MEDIAN:g} m: for metres the depth scale is 1"
-    return ""
+    is_within = np.all(np.isnan(shown) | ((shown > -1.0) & (shown < 2.0)))
+    return "" if is_within else "depths far outside of the unit cube: a metric image is not orthographic"
 
 
 def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedFrame:
-    wanted = ("depth", "K", "projection") + ("labels",) * (not reading.ignore_masks)
+    wanted = ("depth", "K", "projection", "depth_scale") + ("labels",) * (not reading.ignore_masks)
     fields = npz_arrays(path, wanted)
     if "depth" not in fields:
         raise ValueError("expected a field 'depth' in metres")
     depth, labels = fields["depth"], fields.get("labels")
-    if depth.ndim != 2 or depth.dtype.kind != "f" or depth.size == 0:
-        raise ValueError(f"depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
+    if depth.ndim != 2 or depth.dtype.kind not in "fiu" or depth.size == 0:
+        raise ValueError(f"depth: expected numbers (height, width), got {depth.dtype} {depth.shape}")
     if labels is not None:
         if labels.shape != depth.shape or labels.dtype.kind not in "iub":
             expected = f"expected integers of the depth's shape {depth.shape}"
@@ -360,14 +367,12 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
         camera = Camera.from_matrix(fields["K"], width, height)
     except (ValueError, TypeError) as error:
         raise ValueError(f"K: {error}") from error
-    return RecordedFrame(_metres(depth, reading.scale or 1.0), camera, labels, path.name, encoding="32FC1")
-
-
-def _metres(values: np.ndarray, scale: float) -> np.ndarray:
-    """Depth of values in ``scale`` units a metre, as :func:`_single`; what is not before the camera is none either."""
-    with np.errstate(all="ignore"):  # of what is no number, or none that a float holds
-        depth = (values if scale == 1 else np.divide(values, scale, dtype=float)).astype(np.float32)
-    return np.where((depth > 0) & (depth < np.inf), depth, np.float32(np.nan))
+    unit = fields.get("depth_scale")
+    known = None if unit is None else depth_units.stated(float(unit), "depth_scale")
+    found = _metres(depth, reading, known)
+    return RecordedFrame(
+        reading.z(found.depth, camera), camera, labels, path.name, notes="; ".join(found.notes), encoding="32FC1"
+    )
 
 
 def _single(depth: np.ndarray) -> np.ndarray:

@@ -115,7 +115,7 @@ def recorded(
 
     def make(position: int) -> SourceFrame:
         path = paths[position]
-        frame = frame_file.read(path, camera_info or inputs.camera_beside(path), projection)
+        frame = frame_file.read(path, camera_info, projection)
         labels = frame.labels if with_labels else None
         return SourceFrame(frame.depth, frame.camera, labels, frame.name)
 

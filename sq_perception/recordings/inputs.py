@@ -3,8 +3,8 @@
 A folder gives its frames and bags in natural order (frame_2 before frame_10), by their times where all names are times,
 NPYs only where it has nothing else, as matrices of calibrations are such files too; one without any gives those of its
 subfolders.  The camera of its images, and of an image that is named by itself, is ``camera_info.yaml``,
-``camera.yaml``, ``intrinsics.json`` or ``camera_intrinsic.json`` beside it, or in the folder that was named, else the
-YAML of its own name.  What cannot be read comes as an error with the reason, in its place, and the rest follows.
+one of the other ``camera_file.CAMERA_FILES`` beside it, or in the folder that was named, else the YAML of its own name.
+What cannot be read comes as an error with the reason, in its place, and the rest follows.
 """
 
 from __future__ import annotations
@@ -17,16 +17,9 @@ from typing import TypeAlias
 
 from sq_perception.recordings import bag_file, camera_file, frame_file
 from sq_perception.recordings.bag_file import InputOptions, RecordedBag
+from sq_perception.recordings.camera_file import camera_beside, camera_in
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 
-CAMERA_FILES = (
-    "camera_info.yaml",
-    "camera_info.yml",
-    "camera.yaml",
-    "camera.yml",
-    "intrinsics.json",
-    "camera_intrinsic.json",  # Open3D's
-)
 SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 
 _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
@@ -107,11 +100,11 @@ class RecordedInput:
     def _in_folders(self, folder: Path, above: str | Path | None) -> list[_Source]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
         try:
-            camera_info = self._options.camera_info or _camera_file(folder) or above
+            camera_info = self._options.camera_info or camera_in(folder) or above
             if found := in_folder(folder):
                 _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
                 chosen = found[:: self._options.every][: self._options.limit]
-                return [(path, camera_info or _of_its_name(path)) for path in chosen]
+                return [(path, camera_info or camera_beside(path)) for path in chosen]
             folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
         except OSError as error:
             return [(folder, FrameError(f"{folder}: {error}"))]
@@ -153,17 +146,3 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     parts = _DIGITS.split(path.name.lower())
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
 
-
-def camera_beside(path: Path) -> Path | None:
-    """The camera of an image: the file of its folder, or that of its name."""
-    return _camera_file(path.parent) or _of_its_name(path)
-
-
-def _camera_file(folder: Path) -> Path | None:
-    return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
-
-
-def _of_its_name(path: Path) -> Path | None:
-    """The camera that ``sq-perception render`` writes beside an image."""
-    beside = path.with_suffix(".yaml")
-    return beside if beside.is_file() else None

@@ -17,7 +17,13 @@ from typing import Any
 import numpy as np
 
 from sq_msgs_py import poses
-from sq_msgs_py.depth_image import depth_from_message, depth_to_message, grey_from_message, grey_to_message
+from sq_msgs_py.depth_image import (
+    DEPTH_ENCODINGS,
+    depth_to_message,
+    grey_from_message,
+    grey_to_message,
+    pixels_from_message,
+)
 from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
@@ -25,7 +31,8 @@ from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import compressed_depth, unit_cube
+from sq_perception.imaging import compressed_depth, depth_units, unit_cube
+from sq_perception.imaging.depth_units import Metres, Stated
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
 
@@ -272,14 +279,18 @@ def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageT
     return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), header, encoding, types)
 
 
-def depth_of(message: Any, is_cube: bool) -> tuple[np.ndarray, str]:
-    """Depth (height, width) in metres, NaN for nothing, of an image message, and its encoding before it was packed.
+def depth_of(
+    message: Any, is_cube: bool, scale: float | None = None, known: Stated | None = None
+) -> tuple[Metres, str]:
+    """Depth of an image message, and its encoding before it was packed.
 
     Parameters
     ----------
     message
         sensor_msgs/Image of 16UC1 or 32FC1, or CompressedImage of the compressedDepth transport; if ``is_cube`` Image
         of mono8 or mono16, grey values of the unit cube.
+    scale, known
+        Units, as :func:`depth_units.metres` takes them.
 
     Raises
     ------
@@ -287,7 +298,18 @@ def depth_of(message: Any, is_cube: bool) -> tuple[np.ndarray, str]:
         For anything else.
     """
     if is_cube:
-        return unit_cube.depth_from_grey(grey_from_message(message)), str(message.encoding)
+        return Metres(unit_cube.depth_from_grey(grey_from_message(message))), str(message.encoding)
     if hasattr(message, "format"):
-        return compressed_depth.decode(message.format, message.data), compressed_depth.encoding(message.format) or ""
-    return depth_from_message(message), str(message.encoding)
+        numbers = compressed_depth.decode(message.format, message.data)
+        encoding = compressed_depth.encoding(message.format) or ""
+    else:
+        numbers, encoding = pixels_from_message(message, DEPTH_ENCODINGS), str(message.encoding)
+    found = depth_units.metres(numbers, scale, known)
+    return found, encoding if found.scale == depth_units.MILLIMETRES else "32FC1"  # millimetres hold no other units
+
+
+def size_of(message: Any) -> tuple[int, int]:
+    """Width and height of an image or cloud; of a packed image from its header alone, ValueError if it is none."""
+    if hasattr(message, "format"):
+        return compressed_depth.size(message.format, message.data)
+    return int(message.width), int(message.height)

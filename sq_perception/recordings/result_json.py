@@ -81,6 +81,7 @@ def frame_entry(
             "K": frame.camera.matrix.ravel(),
         },
         "message": recovery.message,
+        "input": "; ".join(filter(None, (frame.warning, frame.notes))),
         "ms_by_stage": recovery.milliseconds,
         "plane": recovery.plane,
         "stamp": None if frame.stamp is None else frame.stamp._asdict(),

@@ -36,11 +36,10 @@ import numpy as np
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_blas_thread, short_turns
-from sq_perception.imaging import perforation, raycast
-from sq_perception.imaging.camera import GREATEST_DEPTH, GREATEST_MEDIAN, LEAST_DEPTH, Camera
+from sq_perception.imaging import depth_units, perforation, raycast
+from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import methods, prediction, seen_object, supports
@@ -63,8 +62,6 @@ __all__ = [
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
-_SPARSE = 8
-"""Every so many-th pixel tells what unit an image has."""
 _SEGMENTS = 2
 """For each object that is asked for: a network joins some, and drops what shows none, which may be the largest."""
 
@@ -292,8 +289,9 @@ class Recoverer:
         }
         segmentation = found.segmentation
         message = _left_out(segmentation, options) if bodies else _why_empty(depth, segmentation, readings.labels)
-        message = "; ".join(filter(None, (message, _wrong_unit(readings.depth, camera))))
-        return FrameRecovery(bodies, milliseconds, segmentation.labels, segmentation.plane, message)
+        doubt = depth_units.wrong_unit(readings.depth) if camera.is_pinhole else ""
+        message = "; ".join(filter(None, (message, doubt)))
+        return FrameRecovery(bodies, milliseconds, segmentation.labels, segmentation.plane, message, doubt)
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
@@ -415,16 +413,6 @@ def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
     if not found.is_cut:
         return ""
     return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
-
-
-def _wrong_unit(depth: np.ndarray, camera: Camera) -> str:
-    """A warning where depths (height, width), NaN where nothing was measured, are hardly metres; else empty."""
-    some = depth[::_SPARSE, ::_SPARSE]
-    some = some[np.isfinite(some)]
-    if not camera.is_pinhole or not some.size or quantile(some, 0.5) <= GREATEST_MEDIAN:
-        return ""
-    unit = "depths are metres, not millimetres (recover has --depth-scale)"
-    return f"half of the image is farther than {GREATEST_MEDIAN:g} m: {unit}"
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarray | None) -> str:

@@ -99,7 +99,9 @@ class FrameRecovery:
     plane : (4,) or None
         Support plane, height above it = n.p + d.
     message
-        Why there are no objects, that some were left out, or that the depths are hardly metres; empty otherwise.
+        Why there are no objects, that some were left out, and ``doubt``; empty otherwise.
+    doubt
+        Why the image seems to be in another unit or of another kind, and with it all bodies wrong; empty otherwise.
     """
 
     bodies: tuple[Recovery, ...]
@@ -107,6 +109,7 @@ class FrameRecovery:
     labels: np.ndarray
     plane: np.ndarray | None
     message: str
+    doubt: str = ""
 
     @property
     def recovered(self) -> tuple[Recovery, ...]:

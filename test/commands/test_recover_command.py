@@ -197,6 +197,32 @@ def test_meshes_are_the_bodies(tmp_path, kind):
         np.testing.assert_array_equal(np.asarray(part.visual.vertex_colors)[0, :3], colour)
 
 
+def test_obstacles_are_the_bodies_and_larger_where_they_are_less_known(tmp_path, capsys):
+    save_npz(tmp_path / "a.npz")
+    save_npz(tmp_path / "empty.npz", np.full((120, 160), np.nan, np.float32))
+    names = tmp_path / "a.npz", tmp_path / "empty.npz"
+    volumes = {}
+    for inflate in ("0", "2"):
+        folder = tmp_path / inflate
+        frames = recover(tmp_path, *names, "--export", "curobo", "--export-folder", folder, "--export-meshes",
+                         "--inflate", inflate)  # fmt: skip
+        assert [path.name for path in folder.iterdir()] == ["a.yml"]
+        world = yaml.safe_load((folder / "a.yml").read_text())
+        assert list(world["mesh"]) == ["body_0", "body_1"]
+        for one, entry in zip(world["mesh"].values(), frames[0]["superquadrics"], strict=True):
+            np.testing.assert_allclose(one["pose"][:3], entry["translation"], atol=1e-6)
+        parts = [trimesh.Trimesh(one["vertices"], one["faces"]) for one in world["mesh"].values()]
+        volumes[inflate] = [part.volume for part in parts]
+    entries = frames[0]["superquadrics"]
+    bodies = [Superquadric(one["size"], one["shape"], one["translation"], one["rotation"]) for one in entries]
+    for volume, larger, body in zip(volumes["0"], volumes["2"], bodies, strict=True):
+        assert body.volume() < volume < 1.1 * body.volume()
+        assert larger > volume
+    words = ["--method", "classic", "--export", "mjcf", "--export-folder", str(tmp_path / "classic"), "--inflate", "1"]
+    assert main.main(["recover", str(tmp_path / "a.npz"), *words]) == 1
+    assert "--export: covariances: expected finite ones" in capsys.readouterr().err
+
+
 def test_the_schema_describes_what_is_written(tmp_path, repository):
     """Document and lines, a frame with masks and tracks and one of the cube; and every field is described."""
     jsonschema = pytest.importorskip("jsonschema")

@@ -58,7 +58,7 @@ def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, caps
     assert "mm open" in capsys.readouterr().out
 
 
-def test_a_body_that_failed_is_listed_last_with_the_reason(frame, tmp_path, capsys):
+def test_a_body_that_failed_has_the_reason_and_its_number(frame, tmp_path, capsys):
     recorded = dict(np.load(frame))
     labels = np.where(recorded["labels"] == recorded["labels"][60, 80], 7, 0)
     labels[0, :3] = 2
@@ -66,11 +66,12 @@ def test_a_body_that_failed_is_listed_last_with_the_reason(frame, tmp_path, caps
     out = tmp_path / "out.json"
     assert main.main(["grasp", str(frame), "--json", str(out)]) == 0
     can, failed = json.loads(out.read_text())["frames"][0]["bodies"]
+    assert (can["body"], failed["body"]) == (0, 1)
     assert (can["label"], can["reason"]) == (7, "")
     assert can["grasps"]
     assert (failed["label"], failed["grasps"]) == (2, [])
     assert failed["reason"].startswith("failed: ")
-    assert f"     2  {failed['reason']}" in capsys.readouterr().out
+    assert f"  1 {failed['reason']}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("height", "width"), [(2, 2000), (400, 2)])

@@ -50,7 +50,7 @@ class Recoverer:
         self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
         self.bodies: tuple[Recovery, ...] = (ball(),)
         self.plane: np.ndarray | None = None
-        self.message = ""
+        self.message = self.doubt = ""
         self.error: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
@@ -63,7 +63,8 @@ class Recoverer:
         assert self.gate.wait(PATIENCE)
         if self.error is not None:
             raise self.error
-        return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), self.plane, self.message)
+        labels = np.zeros(depth.shape, np.int32)
+        return FrameRecovery(self.bodies, {"total": 1.0}, labels, self.plane, self.message, doubt=self.doubt)
 
 
 def every_frame_anew(recoverer: Any, last: Any) -> Any:

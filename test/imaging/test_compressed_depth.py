@@ -11,6 +11,7 @@ import pytest
 from packed_depth import pack
 
 from sq_perception.imaging import compressed_depth, rvl
+from sq_perception.imaging.depth_units import metres
 
 
 @pytest.fixture
@@ -62,10 +63,10 @@ def millimetres(depth):
 def test_millimetres_come_back(depth):
     image_format, data = pack(depth)
     assert image_format == "16UC1; compressedDepth png"
-    np.testing.assert_array_equal(compressed_depth.decode(image_format, data), depth)
+    np.testing.assert_array_equal(metres(compressed_depth.decode(image_format, data)).depth, depth)
     assert compressed_depth.size(image_format, data) == (64, 48)
     # The reference's older versions name no packing.
-    np.testing.assert_array_equal(compressed_depth.decode("16UC1; compressedDepth", data), depth)
+    np.testing.assert_array_equal(metres(compressed_depth.decode("16UC1; compressedDepth", data)).depth, depth)
 
 
 def test_inverse_depth_comes_back_within_half_a_level(depth):
@@ -80,7 +81,7 @@ def test_inverse_depth_comes_back_within_half_a_level(depth):
 @pytest.mark.parametrize("encoding", ["16UC1", "32FC1"])
 def test_what_cannot_be_packed_becomes_nothing(encoding):
     depth = np.array([[np.nan, np.inf, 0.0, -1.0, 1e-5, 80.0, 1.0]])
-    found = compressed_depth.decode(*pack(depth, encoding))
+    found = metres(compressed_depth.decode(*pack(depth, encoding))).depth
     assert np.isnan(found[0, :-1]).all()
     assert found[0, -1] == pytest.approx(1.0, abs=1e-4)
 
@@ -92,7 +93,7 @@ def test_rvl_comes_back(rng, share):
     assert compressed_depth.size("16UC1; compressedDepth rvl", data) == (64, 48)
     np.testing.assert_array_equal(rvl.decode(data[20:], 64, 48), grey)
     found = compressed_depth.decode("16UC1; compressedDepth rvl", data)
-    np.testing.assert_array_equal(np.nan_to_num(found), grey / np.float32(1000))
+    np.testing.assert_array_equal(found, grey)
 
 
 def test_both_packings_say_the_same(depth):

@@ -309,7 +309,6 @@ class TestCanonicalView:
         extent = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True).extent
         depth[40:50, 80:], depth[50:60, 80:] = 1.0, 1 - 0.25 * extent
         depth[60:70, 80:], depth[70:80, 80:] = 1 + 0.25 * extent, np.nan
-        depth[40:50, 40:50] = np.nan  # within the mask
         view = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
         rows, beyond = np.array([5, 15, 25, 35]), 40
         i = np.rint((0.5 + (rows - 19.5) / (40 * canonical_view.MARGIN)) * 64 - 0.5).astype(int)
@@ -318,10 +317,15 @@ class TestCanonicalView:
         np.testing.assert_allclose(view.beside[i, j], [0, 0.25, -0.25, np.nan], atol=0.01)
         np.testing.assert_allclose(view.with_steps[i, j], [flush, 1.5 * hidden, 0.5 * flush, hidden], atol=0.02)
         np.testing.assert_array_equal(view.hidden[i, j], [False, True, False, True])
-        assert view.with_steps[i[0], i[0]] == covered
         assert view.with_steps[i[2], 1] == 0  # far behind
         np.testing.assert_array_equal(view.with_steps[view.image > 0], view.image[view.image > 0])
         np.testing.assert_array_equal(view.with_steps < flush - 1e-3, view.hidden)
+        # Who drew a mask over pixels without a reading knows where the thing ends.
+        depth[40:50, 40:50] = np.nan
+        drawn = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
+        assert drawn.with_steps[i[0], i[0]] == covered
+        assert drawn.with_steps[i[3], j] == 0
+        np.testing.assert_array_equal(drawn.with_steps[i[:3], j], view.with_steps[i[:3], j])
 
     def test_the_table_is_no_step(self) -> None:
         """It goes on beside all that stands on it, at any depth: its height is shown besides."""

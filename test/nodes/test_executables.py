@@ -15,7 +15,9 @@ from sq_perception.nodes.executables import PROGRAMS
 
 def run(name: str, *arguments: str, before: str = "", after: str = "") -> subprocess.CompletedProcess[str]:
     """A program, as the script that pip makes for it starts it, with code before and after the import."""
-    code = f"import sys; sys.argv[0] = '/somewhere/bin/{name}'\n{before}\n"
+    # Tests that run in the background of a shell inherit an ignored SIGINT.
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += f"import sys; sys.argv[0] = '/somewhere/bin/{name}'\n{before}\n"
     code += f"from sq_perception.nodes.executables import {name}\n{after}\nsys.exit({name}())"
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
@@ -58,7 +60,8 @@ def test_ctrl_c_before_the_start_leaves_no_traceback(moment: dict[str, str]) -> 
 
 
 def test_only_the_programs_give_ctrl_c_another_meaning() -> None:
-    code = "import signal, sq_perception.nodes.executables as e; print(signal.getsignal(signal.SIGINT).__name__)"
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += "import sq_perception.nodes.executables as e; print(signal.getsignal(signal.SIGINT).__name__)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "default_int_handler\n"
 

@@ -25,7 +25,8 @@ from sq_perception.nodes.executables import PROGRAMS
 
 PATIENCE = 120.0
 SERVICE = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored, if this is in the background of a shell
 from launch import LaunchDescription, LaunchService
 from launch.actions import IncludeLaunchDescription
 from launch.launch_description_sources import PythonLaunchDescriptionSource

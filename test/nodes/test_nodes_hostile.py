@@ -21,12 +21,12 @@ from std_msgs.msg import Header
 from sq_msgs_py.depth_image import (
     DEPTH_ENCODINGS,
     ImageError,
-    depth_from_message,
     intrinsics_from_message,
     labels_from_message,
 )
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.imaging.camera import Camera
+from sq_perception.recordings import publication
 from sq_perception.recovery.recoverer import Recoverer
 
 FIELDS = ("encoding", "image size", "step", "data")
@@ -50,7 +50,7 @@ def read(reader: Callable[[Any], Any], message: Any) -> tuple[Any, str]:
 @QUICK
 @given(images())
 def test_a_depth_image_is_read_whole_or_refused_with_its_field(message):
-    depth, words = read(depth_from_message, message)
+    depth, words = read(lambda one: publication.depth_of(one, False)[0].depth, message)
     if depth is None:
         assert words.split(":")[0] in FIELDS
         return
@@ -101,7 +101,7 @@ def test_whatever_can_be_read_is_recovered_or_has_a_reason(recoverer):
     @given(frames(masked=True))
     def check(frame):
         try:
-            depth = depth_from_message(frame.image)
+            depth = publication.depth_of(frame.image, False)[0].depth
             known = intrinsics_from_message(frame.info or sound_info(frame.image))
             camera = Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
             labels = None if frame.mask is None else labels_from_message(frame.mask)

@@ -9,13 +9,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from frame_node_bench import CAMERA
 from packed_depth import pack
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
-from sq_msgs_py.depth_image import labels_to_message
+from sq_msgs_py.depth_image import depth_to_message, labels_to_message
 
 
 def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
@@ -41,6 +42,39 @@ def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
     header = bench.header()
     packed.publish(CompressedImage(header=header, format=form, data=data))
     bench.until(lambda: any(one.header == header for one in bench.answers))
+
+
+def test_units_marks_and_ranges_are_read_as_in_files(make_bench, monkeypatch):
+    bench = make_bench("-p", "depth_scale:=1000.0")
+    bench.send_info()
+    bench.answer(bench.depth(value=500.0))
+    np.testing.assert_allclose(bench.recoverer.asked[-1][0], 0.5)
+    bench.node.set_parameters([Parameter("depth_scale", value=0.0)])
+    infos: list[str] = []
+    monkeypatch.setattr(bench.node.get_logger(), "info", lambda text, **_: infos.append(text))
+    depth = np.full((48, 64), 0.5)
+    depth[20:25, 20:25] = 10.0
+    bench.answer(depth_to_message(depth, bench.header()))
+    np.testing.assert_array_equal(np.isnan(bench.recoverer.asked[-1][0]), depth == 10)
+    assert any("10 m is taken for no reading" in text for text in infos)
+    bench.node.set_parameters([Parameter("depth_kind", value="range")])
+    bench.answer(bench.depth(value=0.5))
+    seen, camera, _, _ = bench.recoverer.asked[-1]
+    np.testing.assert_allclose(np.linalg.norm(camera.points(seen), axis=2), 0.5, rtol=1e-6)
+
+
+def test_an_image_that_seems_to_have_another_unit_is_a_warning_in_log_and_diagnostics(bench, monkeypatch):
+    """Though it is answered, and has no bodies."""
+    reports, warnings = bench.hear(DiagnosticArray, "/diagnostics"), []
+    monkeypatch.setattr(bench.node.get_logger(), "warning", lambda text, **_: warnings.append(text))
+    bench.recoverer.bodies, bench.recoverer.doubt, bench.recoverer.message = (), "hardly metres", "hardly metres"
+    bench.send_info()
+    bench.until(lambda: bench.node.count_publishers("/diagnostics") and bench.node.count_subscribers("/diagnostics"))
+    bench.answer(bench.depth(value=500.0))
+    assert "hardly metres" in warnings
+    found = lambda: [one.status[0] for one in reports if one.status[0].message == "hardly metres"]  # noqa: E731
+    bench.until(found)
+    assert found()[0].level == DiagnosticStatus.WARN
 
 
 def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_bench):

@@ -15,8 +15,8 @@ from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
-from sq_msgs_py.depth_image import depth_from_message
 from sq_perception.fitting.fit import Status
+from sq_perception.recordings import publication
 
 
 def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
@@ -37,7 +37,7 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     bench.until(lambda: shown and rendered)
     assert sorted({marker.id for marker in shown[0].markers}) == [1, 5]
     assert all(marker.header == image.header for marker in shown[0].markers)
-    depth = depth_from_message(rendered[0])
+    depth = publication.depth_of(rendered[0], False)[0].depth
     assert rendered[0].header == image.header
     assert np.nanmin(depth) == pytest.approx(0.4, abs=2e-3)
     assert np.isnan(depth).any()

@@ -15,7 +15,9 @@ from std_msgs.msg import Header
 from sq_msgs_py.depth_image import depth_to_message
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.frame import decode, image_topic, size_of
+from sq_perception.nodes.frame import decode, image_topic
+from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.recordings.publication import size_of
 
 
 @pytest.mark.parametrize(

@@ -65,14 +65,6 @@ def test_package_xml_is_well_formed(repository: Path) -> None:
     assert all("@" in person.email for person in package.maintainers)
 
 
-def test_versions_agree(repository: Path) -> None:
-    import sq_perception
-
-    package = catkin_package.parse_package(str(repository / "package.xml"))
-    assert package.version == sq_perception.__version__
-    assert f'version="{package.version}"' in (repository / "setup.py").read_text(encoding="utf-8")
-
-
 def test_executables_are_where_ros2_run_looks(install: Path) -> None:
     for name in EXECUTABLES:
         path = install / PACKAGE / "lib" / PACKAGE / name

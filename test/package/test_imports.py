@@ -104,10 +104,10 @@ def test_only_nodes_know_ros() -> None:
 def test_only_nodes_bags_and_calibrations_join_the_two_packages() -> None:
     """What a recorded message says is decoded by the code that decodes a live one; that needs no ROS."""
     joining = {path for path in PERCEPTION.rglob("*.py") if not is_node(path) and "sq_msgs_py" in roots(path)}
-    names = ("recordings/bag_file", "imaging/calibration", "recordings/result_bag", "recordings/publication")
-    assert joining == {PERCEPTION / f"{name}.py" for name in names}
+    names = ("bag_file", "result_bag", "publication", "scene_export")
+    assert joining == {PERCEPTION / "imaging/calibration.py", *(PERCEPTION / f"recordings/{name}.py" for name in names)}
     absent = f"import sys; sys.modules.update(dict.fromkeys({ROS!r}))"
-    modules = loaded_after(f"{absent}; import sq_perception.recordings.inputs, sq_perception.commands.recover")
+    modules = loaded_after(f"{absent}; import sq_perception.recordings.inputs, sq_perception.recordings.scene_export")
     assert "sq_msgs_py.depth_image" in modules
     assert not modules & {"rosbags", "torch"}
     modules = loaded_after(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import email
 import os
 import re
 import stat
@@ -11,8 +12,12 @@ import sys
 import tarfile
 import zipfile
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
+import yaml
+
+import sq_perception
 
 NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 PACKAGE = "sq_perception"
@@ -159,6 +164,25 @@ def test_package_xml_names_every_ros_package_that_is_imported(repository: Path) 
     assert ros - optional <= declared
     assert not declared & optional
     assert all(one in text for one in optional)
+
+
+def test_versions_and_addresses_are_those_of_package_xml(repository: Path, prefix: Path) -> None:
+    about = ElementTree.parse(repository / "package.xml").getroot()  # noqa: S314 - our own
+    version = about.findtext("version")
+    assert sq_perception.__version__ == version
+    assert f'version = "{version}"' in (repository / "sq_msgs_py" / "pyproject.toml").read_text()
+    cited = yaml.safe_load((repository / "CITATION.cff").read_text())
+    assert (cited["cff-version"], str(cited["version"]), cited["license"]) == ("1.2.0", version, "Apache-2.0")
+    assert {"message", "title", "authors"} <= set(cited)
+    assert cited["references"][0]["authors"] == [{"family-names": "Oblak", "given-names": "Tim"}]
+    (path,) = prefix.glob(f"lib/python3*/site-packages/{PACKAGE}-*.dist-info/METADATA")
+    metadata = email.message_from_string(path.read_text())
+    maintainer = about.find("maintainer")
+    assert maintainer is not None
+    assert (metadata["Maintainer"], metadata["Maintainer-email"]) == (maintainer.text, maintainer.get("email"))
+    assert metadata["Version"] == version
+    assert metadata["Home-page"] == about.findtext("url")
+    assert "superquadrics" in metadata["Keywords"]
 
 
 def test_the_messages_install_alone_with_numpy_only(source_copy: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -41,6 +42,15 @@ def run(repository: Path, page: str, given: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
+def test_the_reference(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    given = run(repository, "api.md", {})
+    assert "IoU 0.84" in capsys.readouterr().out
+    np.testing.assert_allclose(given["can"].gauge(given["points"]), 1, atol=1e-9)
+    assert given["surface"].volume == pytest.approx(float(given["can"].volume()), rel=0.02)
+    assert (tmp_path / "cans.stl").stat().st_size > 1000
+
+
 def test_the_surface_fit(repository: Path) -> None:
     found = run(repository, "surface_fit.md", names())["found"]
     np.testing.assert_allclose(found.superquadric.translation, BODY.translation, atol=0.03)
@@ -65,7 +75,7 @@ def test_tracking(repository: Path) -> None:
     assert given["track"].observation == 0
 
 
-def test_outputs(repository: Path) -> None:
+def test_outputs(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The service is a stand-in that has answered; test_nodes_wiring.py asks a real one."""
     pytest.importorskip("shape_msgs", reason="needs the extra 'ros'")
     from std_msgs.msg import Header
@@ -77,13 +87,42 @@ def test_outputs(repository: Path) -> None:
 
     bodies = truth_array(Superquadric.stack([BODY]))
     given = {"message": to_message(bodies, Header()), "quaternion": [0, 0, 0, 1.0], "shift": [0, 0, 1.0]}
-    given |= {"node": MagicMock(), "rclpy": MagicMock(), "Trigger": Trigger}
+    given |= {"node": MagicMock(), "rclpy": MagicMock(), "Trigger": Trigger, "PlanningScene": object}
+    given["superquadrics"] = Superquadric.stack([BODY])
+    monkeypatch.chdir(tmp_path)
     asked = given["node"].create_client().call_async()
     asked.result.return_value = Trigger.Response(success=True, message=text_of(bodies, Header(frame_id="map"), ""))
     run(repository, "outputs.md", given)
     np.testing.assert_allclose(given["there"].translation, [[0, 0, 1.5]], atol=1e-6)
     assert given["answer"].frame_id == "map"
     np.testing.assert_array_equal(given["answer"].bodies.size, bodies.size)
+    assert (tmp_path / "scene.sdf").is_file()
+    _check_octomap_recipe(given, monkeypatch)
+
+
+def _check_octomap_recipe(given: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The octomap is cleared for what is new or has moved, not for what is said again or goes."""
+    import soft_messages
+    from std_msgs.msg import Header
+
+    from sq_msgs_py.collision_objects import Scene, planning_scene
+    from sq_perception.recordings.publication import truth_array
+
+    soft_messages.install(monkeypatch)
+    scene, here = Scene(), truth_array(Superquadric.stack([BODY, BODY]))
+    there = replace(here, translation=here.translation + [0.0, 0.0, 0.1])
+
+    def cleared(bodies: Any, again: bool = False) -> int:
+        if again:
+            scene.repeat()
+        before = given["clear"].call_async.call_count
+        message = planning_scene(scene.changes(bodies, Header(frame_id="map")))
+        assert message.is_diff
+        given["on_scene"](message)
+        return given["clear"].call_async.call_count - before
+
+    assert [cleared(here), cleared(here), cleared(here, again=True), cleared(there)] == [1, 0, 0, 1]
+    assert [cleared(there.where(there.id == there.id[0])), cleared(there)] == [0, 1]
 
 
 def test_bags(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

@@ -30,6 +30,7 @@ from sq_perception.imaging.rectification import Rectification
 from sq_perception.recordings import bag_file, bag_reader
 from sq_perception.recordings.bag_file import InputOptions, RecordedBag
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
+from sq_perception.recordings.inputs import RecordedInput
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 T = {name.rpartition("/")[2]: kind for name, kind in TYPES.types.items()}
@@ -221,9 +222,55 @@ def test_a_missing_camera_info_is_named_and_can_be_given(tmp_path, grey):
     assert isinstance(error, FrameError)
     assert TOPIC in str(error)
     assert "1.000000000" in str(error)
-    assert f"no camera_info on {INFO}" in str(error)
+    assert f"no camera_info on {INFO} (camera_info topics: /colour/camera_info)" in str(error)
     (frame,) = frames(bag, camera_info="200,200,79.5,59.5")
     assert frame.camera == CAMERA
+
+
+ELSEWHERE = "/device_0/sensor_0/Depth_0/info/camera_info"
+
+
+def test_a_camera_info_elsewhere_is_used_where_it_is_the_only_one_that_fits_and_named(tmp_path, grey):
+    others = [("/left/camera_info", 1, info(1, size=(80, 60))), ("/color/camera_info", 1, info(1, widened(150.0)))]
+    contents = [*others, (TOPIC, 1, image(grey, 1, "16UC1")), (ELSEWHERE, 1, info(1))]
+    (frame,) = frames(write(tmp_path / "bag", contents))
+    assert frame.camera == CAMERA
+    assert ELSEWHERE in frame.notes
+    late = [*contents, ("/right/camera_info", 1, info(2, widened(250.0)))]
+    (frame,) = frames(write(tmp_path / "late", late))
+    assert frame.camera == CAMERA, "the stamp decides"
+    two = write(tmp_path / "two", [*contents, ("/right/camera_info", 1, info(1, widened(250.0)))])
+    (error,) = frames(two)
+    assert f"{ELSEWHERE}, /left/camera_info, /right/camera_info" in str(error)
+    assert "--camera-info-topic" in str(error)
+    (frame,) = frames(two, camera_info_topic="right/camera_info")
+    assert frame.camera.fx == 250
+    with pytest.raises(FrameError, match=f"no camera_info on /nowhere; camera_info topics: .*{ELSEWHERE}"):
+        RecordedBag(two, InputOptions(camera_info_topic="/nowhere"))
+
+
+def test_marks_units_and_ranges_are_those_of_files(tmp_path, grey):
+    holes = grey == 0
+    for number, (topic, message) in enumerate(
+        [
+            (TOPIC, image(np.where(holes, 65535, grey), 1, "16UC1")),
+            (TOPIC, image(np.where(holes, 10.0, metres(grey) / 2), 1, "32FC1")),
+            (TOPIC + "/compressedDepth", packed(np.where(holes, 65535, grey).astype(np.uint16), 1, "16UC1")),
+        ]
+    ):
+        (frame,) = frames(write(tmp_path / f"bag{number}", [(INFO, 1, info(1)), (topic, 1, message)]))
+        np.testing.assert_array_equal(np.isnan(frame.depth), holes)
+        assert "is taken for no reading" in frame.notes
+    (tmp_path / "camera.json").write_text(json.dumps({"cam_K": K.ravel().tolist(), "depth_scale": 0.1}))
+    (frame,) = frames(tmp_path / "bag0", camera_info=tmp_path / "camera.json", reading=Reading(kind="range"))
+    ranges = np.linalg.norm(CAMERA.points(frame.depth), axis=2)
+    np.testing.assert_allclose(ranges[~holes], metres(grey)[~holes] / 10, rtol=1e-5)
+
+
+def test_a_bag_of_ros_1_names_the_converter(tmp_path):
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
+    ((_, error),) = RecordedInput([str(tmp_path / "a.bag")])
+    assert "rosbags-convert --src" in str(error)
 
 
 def test_distortion_is_undone_unless_the_topic_is_a_rectified_one(tmp_path, grey):

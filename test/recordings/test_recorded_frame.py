@@ -173,9 +173,9 @@ def npz_without(path, name):
 BAD_NPZ = {
     "no depth": (lambda p: npz_without(p, "depth"), "field 'depth'"),
     "no K": (lambda p: npz_without(p, "K"), "field 'K'"),
-    "integers": (lambda p: save_npz(p, depth=np.ones((48, 64), np.uint16)), "floats"),
-    "a volume": (lambda p: save_npz(p, depth=np.ones((48, 64, 2))), "floats"),
-    "no pixel": (lambda p: save_npz(p, depth=np.ones((0, 64))), "floats"),
+    "bytes": (lambda p: save_npz(p, depth=np.ones((48, 64), np.uint8)), "16 bit"),
+    "a volume": (lambda p: save_npz(p, depth=np.ones((48, 64, 2))), "numbers"),
+    "no pixel": (lambda p: save_npz(p, depth=np.ones((0, 64))), "numbers"),
     "zero K": (lambda p: save_npz(p, K=np.zeros((3, 3))), "positive"),
     "NaN K": (lambda p: save_npz(p, K=np.full((3, 3), np.nan)), "finite"),
     "text K": (lambda p: save_npz(p, K=np.full((3, 3), "x")), "K:"),
@@ -209,9 +209,10 @@ def test_bad_images_are_named(tmp_path, info):
     cv2.imwrite(str(tmp_path / "eight.png"), np.ones((48, 64), np.uint8))
     with pytest.raises(FrameError, match="orthographic"):
         read(tmp_path / "eight.png", info)
-    cv2.imwrite(str(tmp_path / "depth.png"), np.ones((48, 64), np.uint16))
+    (tmp_path / "alone").mkdir()
+    cv2.imwrite(str(tmp_path / "alone" / "depth.png"), np.ones((48, 64), np.uint16))
     with pytest.raises(FrameError, match="camera_info"):
-        read(tmp_path / "depth.png")
+        read(tmp_path / "alone" / "depth.png")
     cv2.imwrite(str(tmp_path / "other.png"), np.ones((10, 10), np.uint16))
     with pytest.raises(FrameError, match="does not fit"):
         read(tmp_path / "other.png", info)
@@ -274,13 +275,14 @@ def test_names_that_no_file_can_have_are_named(tmp_path):
     ("text", "reason"),
     [
         ("", "mapping"),
-        ("[1, 2", "not YAML"),
+        ("[1, 2", "four numbers"),
+        ("{1, 2", "not YAML"),
         ("just text", "mapping"),
         ("!!python/object/apply:os.system ['true']", "not YAML"),
-        ("image_width: 64", "image_height"),
-        ("{image_width: wide, image_height: 48}", "positive integer"),
+        ("{image_width: 64, k: [9, 0, 0, 0, 9, 0, 0, 0, 1]}", "image_height"),
+        ("{image_width: wide, image_height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1]}", "positive integer"),
         ("{image_width: 64, image_height: 48}", "camera_matrix"),
-        ("{image_width: 64, image_height: 48, k: [1, 2]}", "9 finite numbers"),
+        ("{image_width: 64, image_height: 48, k: [1, 2]}", "4 or 9 or 12 or 16 finite numbers"),
         ("{image_width: 64, image_height: 48, k: [a, b]}", "expected numbers"),
         ("{width: 64, height: 48, k: [0, 0, 0, 0, 0, 0, 0, 0, 0]}", "above 0"),
         ("{width: 64, height: 48, k: [9, 1, 0, 0, 9, 0, 0, 0, 1]}", "no skew"),

@@ -1,0 +1,202 @@
+"""Numbers of a depth image to metres: the one place that knows units, marks of "nothing measured" and ranges.
+
+    z = number / scale              scale: units a metre
+    z = range / |((u - cx) / fx, (v - cy) / fy, 1)|
+
+The scale is the caller's; else the one that a file or camera states; else 1000 for whole numbers and 1 for floats (REP
+118).  No reading are 0, negative numbers, NaN, infinity, and
+
+- the largest number that an integer, or half precision, holds;
+- a number that many pixels share exactly, beyond all other readings by a fifth, if programs use it for this (2^k - 1,
+  10 000 or 100 000, as it stands, or in millimetres), or a tenth of its pixels are holes in surfaces.
+
+So a flat wall, a floor seen from straight above, quantised depths and readings that a sensor clips at its range stay what
+they are: the first two lie around things and not in them, the others have readings just before them.  Orthographic grey
+values never come here.
+
+A Kinect's raw disparities (11 bit, 2047 = nothing) look like millimetres.  They are linear in the pixels of a plane,
+where a depth image has a linear 1/z; an image of them is refused.
+
+Reference: REP 118; https://openkinect.org/wiki/Imaging_Information for the disparities.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging.camera import GREATEST_MEDIAN, LEAST_MEDIAN, Camera
+
+DepthKind = Literal["z", "range"]
+"""What a depth image holds: z along the optical axis, or the distance to the camera's centre along each ray."""
+MILLIMETRES = 1000.0
+"""Units a metre."""
+_MOST_METRES_A_UNIT, _MOST_MILLIMETRES_A_UNIT = 0.005, 50.0
+"""A stated depth_scale up to the first is metres a unit (librealsense: 0.001, 0.000125), up to the second millimetres a
+unit (BOP: 0.1, 1), beyond it units a metre (TUM: 5000): no known one is within a factor of 2 of either."""
+_MANY, _LEAST = 1e-4, 10
+"""Share of an image's pixels, and their number, that stray readings do not reach."""
+_BEYOND = 1.2
+"""Ratio of a mark to the readings before it."""
+_STRAYS = 0.01
+"""Share of the readings that may lie in between, as where an image was scaled down."""
+_HOLES = 0.1
+"""Share of a mark's pixels in holes, which have readings all around."""
+_NO_DISPARITY, _DISPARITIES = 2047, (300, 1090)
+"""Raw numbers of a Kinect: nothing measured; from half a metre to ten metres."""
+
+
+class UnitsError(ValueError):
+    """Numbers that are no depths; the message says what they seem to be and what to do."""
+
+
+@dataclass(frozen=True)
+class Stated:
+    """Units a metre of whole numbers, and the words for where that stands."""
+
+    scale: float
+    source: str
+
+
+@dataclass(frozen=True, eq=False)
+class Metres:
+    """A depth image, float32 (height, width) in metres, NaN where nothing was measured.
+
+    ``scale`` has the units a metre that were used.  ``notes`` say what was decided that the numbers alone do not show,
+    in the same words for each image of a camera.
+    """
+
+    depth: np.ndarray
+    scale: float = 1.0
+    notes: tuple[str, ...] = ()
+
+
+def stated(value: float, where: str) -> Stated:
+    """The unit of a ``depth_scale``, whose convention shows in its magnitude; ValueError unless it is positive."""
+    if not 0 < value < math.inf:
+        raise ValueError(f"{where}: expected a positive number, got {value:g}")
+    if value <= _MOST_METRES_A_UNIT:
+        return Stated(1 / value, f"{where} = {value:g} (metres a unit)")
+    if value <= _MOST_MILLIMETRES_A_UNIT:
+        return Stated(MILLIMETRES / value, f"{where} = {value:g} (millimetres a unit)")
+    return Stated(value, f"{where} = {value:g} (units a metre)")
+
+
+def metres(numbers: np.ndarray, scale: float | None = None, known: Stated | None = None) -> Metres:
+    """Depth of the numbers (height, width) of an image, of any real type and byte order.
+
+    Parameters
+    ----------
+    numbers
+    scale
+        Units a metre that the caller asks for: goes before all else.
+    known
+        What is stated beside the image; of floats it only counts where they can hardly be metres.
+
+    Raises
+    ------
+    UnitsError
+        For raw disparities.
+    """
+    is_whole = numbers.dtype.kind in "iu"
+    notes: list[str] = []
+    used = scale or (MILLIMETRES if is_whole else 1.0)
+    if scale is None and known is not None and (is_whole or wrong_unit(numbers)):
+        used = known.scale
+        notes.append(f"{used:.6g} units are a metre: {known.source}")
+    with np.errstate(all="ignore"):  # of what is no number, or none that a float holds
+        depth = (numbers if used == 1 else np.divide(numbers, used, dtype=float)).astype(np.float32)
+        none = ~((depth > 0) & (depth < np.inf))
+    if is_whole or numbers.dtype.itemsize == 2:
+        largest = np.iinfo(numbers.dtype).max if is_whole else np.finfo(numbers.dtype).max
+        saturated = numbers == largest
+        if saturated.any():
+            none |= saturated
+            notes.append(f"{largest:g} is taken for no reading, as it is the largest number of {numbers.dtype.name}")
+    depth[none] = np.nan
+    while mark := _mark(depth, used):
+        if is_whole and scale is None and known is None and round(mark * used) == _NO_DISPARITY:
+            _refuse_disparities(numbers)
+        depth[depth == mark] = np.nan
+        notes.append(
+            f"{mark * used:.6g}{' m' * (used == 1)} is taken for no reading, as many pixels have just this number, "
+            "beyond all others"
+        )
+    return Metres(depth, used, tuple(notes))
+
+
+def z_from_range(ranges: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth z, float32 (height, width), of distances to the centre of a pinhole camera, metres."""
+    if not camera.is_pinhole:
+        return ranges
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    return (ranges / np.sqrt(1 + x**2 + y[:, None] ** 2)).astype(np.float32)
+
+
+def wrong_unit(depth: np.ndarray) -> str:
+    """The complaint where depths (height, width), metres, are those of no camera; empty for others."""
+    some = depth[::8, ::8]
+    some = some[(some > 0) & (some < np.inf)]
+    middle = float(np.median(some)) if some.size else 1.0
+    if middle > GREATEST_MEDIAN:
+        found, unit = f"farther than {GREATEST_MEDIAN:g} m", "millimetres the depth scale is 1000"
+    elif middle < LEAST_MEDIAN:
+        found, unit = f"nearer than {LEAST_MEDIAN:g} m", "metres the depth scale is 1"
+    else:
+        return ""
+    return f"half of the image is {found}: for {unit} (--depth-scale of commands, depth_scale of nodes)"
+
+
+def _mark(depth: np.ndarray, scale: float) -> float | None:
+    """The greatest reading, if it is a mark of pixels without one; None if it is not."""
+    top = np.fmax.reduce(depth, axis=None)
+    held = depth == top
+    count = np.count_nonzero(held)
+    if count < max(_MANY * depth.size, _LEAST):  # of NaN, too
+        return None
+    others = depth[depth < top]
+    if np.count_nonzero(others > top / _BEYOND) > _STRAYS * others.size or not others.size:
+        return None
+    if any(_is_code(float(top) * unit) for unit in (scale, MILLIMETRES)):
+        return float(top)
+    none = (held | np.isnan(depth)).astype(np.uint8)
+    _, parts, boxes, _ = cv2.connectedComponentsWithStats(none, connectivity=4)
+    left, upper, width, height, _ = boxes.T
+    is_hole = (left > 0) & (upper > 0) & (left + width < depth.shape[1]) & (upper + height < depth.shape[0])
+    return float(top) if np.count_nonzero(is_hole[parts[held]]) >= _HOLES * count else None
+
+
+def _is_code(value: float) -> bool:
+    """Whether a number is one that programs write where they have none."""
+    whole = round(value)
+    is_full = whole >= 1023 and (whole + 1) & whole == 0
+    return abs(value - whole) < 1e-6 * value and (is_full or whole in (10_000, 100_000))
+
+
+def _refuse_disparities(numbers: np.ndarray) -> None:
+    """Raise UnitsError if planes of the image are linear in its numbers, and not in their inverses."""
+    step = max(1, math.isqrt(numbers.size // 4000))
+    v, u = np.nonzero((numbers[::step, ::step] > 0) & (numbers[::step, ::step] < _NO_DISPARITY))
+    value = numbers[::step, ::step][v, u].astype(float)
+    low, high = _DISPARITIES
+    if value.size < 100 or np.count_nonzero((value < low) | (value > high)) > _STRAYS * value.size:
+        return
+    pixels = np.stack([u, v, np.ones(u.size)], axis=1)
+    chosen = np.random.default_rng(0).integers(value.size, size=(300, 3))
+    chosen = chosen[np.abs(np.linalg.det(pixels[chosen])) > 1]
+    on_plane = []
+    for form in (lambda x: x, lambda x: 1 / x):
+        planes = np.linalg.solve(pixels[chosen], form(value[chosen])[..., None])[..., 0]
+        with np.errstate(divide="ignore"):
+            off = np.abs(form(planes @ pixels.T) - value)
+        on_plane.append(np.count_nonzero(off < 2, axis=1).max())
+    if on_plane[0] > max(1.2 * on_plane[1], 0.3 * value.size):
+        raise UnitsError(
+            "these seem to be the raw disparities of a Kinect (11 bit, 2047 = nothing), not millimetres: record depth "
+            "in millimetres (freenect: FREENECT_DEPTH_REGISTERED), or convert them: z = 1 / (3.3309 - 0.0030711 raw) m"
+        )
