@@ -1,8 +1,8 @@
 """Networks alone and the fits on the same images, each from the 256 x 256 image to a body of the cube frame.
 
-A network sees the canonical view of the image's largest object; its prediction is carried back and not refined.
+A network sees the canonical view of the image's largest object; its prediction is not refined.
 Predictions are made in batches, which changes no body.  Times are those of :meth:`Recoverer.recover`, image by image:
-segmentation, view, network or fit, and score, everything that a user waits for.  Networks are timed on the first 300
+segmentation, view, network or fit, and score, all that a user waits for.  Networks are timed on the first 300
 images, fits on every image they get.
 
 The loss that a network was trained by, from its file's header, decides its row of the thesis' tables and what
@@ -38,7 +38,7 @@ from sq_perception.segmentation import segments
 
 TIMED_IMAGES = 300
 _NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
-"""Stands in for a body where nothing was recovered; it is outside of the cube."""
+"""Placeholder where nothing was recovered, outside of the cube."""
 
 
 class Answers(NamedTuple):
@@ -176,7 +176,7 @@ def compare(
     images: ThesisImages,
     advance: Callable[[str, int], None] | None = None,
 ) -> list[Outcome]:
-    """Let every contestant recover the first so many bodies of the test set.
+    """Have every contestant recover the first bodies of the test set.
 
     Parameters
     ----------

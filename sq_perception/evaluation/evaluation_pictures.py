@@ -77,7 +77,7 @@ def ranked(outcome: Outcome) -> dict[str, list[int]]:
 
 
 def examples(outcome: Outcome, images: ThesisImages) -> Figure:
-    """Best, median and worst bodies: what was seen, what the prediction looks like from there, and both from aside."""
+    """Best, median and worst bodies: the image, the prediction rendered from the same place, and both from the side."""
     groups = ranked(outcome)
     figure = plots.new_figure(15.0, 6.1)
     rows = figure.add_gridspec(3, _EACH, left=0.045, right=0.995, bottom=0.01, top=0.955, wspace=0.05, hspace=0.14)

@@ -20,8 +20,8 @@ Rotations, q^ predicted, q true, r = q^-1 q^ = (v, w):
 q and -q are one rotation, so that the first is symmetric about pi wherever signs are arbitrary, and 0, pi (about an
 axis of the body) and 2 pi are the same body.  The symmetric angle does not depend on how a body is written; it takes a
 quarter turn about z for none, whatever the sizes, as the IoU shows that.  Where e1 is about e2 and any axis may
-pass for z, only the last one is small for bodies that are alike.  The summary counts as quarter turns the bodies whose
-axes angle is 70 to 110 degrees.
+pass for z, only the last one is small for bodies that are alike.  The summary counts bodies whose axes angle is 70
+to 110 degrees as quarter turns.
 
 A body that was not recovered has IoU 0, and NaN in everything that compares parameters.
 """
@@ -46,18 +46,9 @@ _CYCLES = np.array([[0.5, 0.5, 0.5, 0.5], [-0.5, -0.5, -0.5, 0.5]])
 
 @dataclass(frozen=True, eq=False)
 class FiguresOfMerit:
-    """Figures of n bodies; see the module.
+    """Figures of n bodies, arrays (n,), ``delta_t`` (n, 3); fractions and radians, see the module.
 
-    Attributes
-    ----------
-    iou, volume_iou : (n,)
-        0 to 1; 0 where no body was recovered.
-    delta_a, delta_e, delta_t : (n,), (n,), (n, 3)
-        Errors of volume, shape and place as fractions; NaN where no body was recovered.
-    shortest_arc, axes_angle, symmetric_angle, any_order_angle : (n,)
-        Radians; NaN likewise.
-    milliseconds : (n,)
-        Execution time of the image alone, NaN where it was not measured.
+    ``milliseconds`` is the execution time of each image by itself, NaN where it was not measured.
     """
 
     iou: np.ndarray
@@ -128,14 +119,9 @@ class FiguresOfMerit:
         return {
             "bodies": len(self),
             "recovered": int(recovered.sum()),
-            "iou_mean": _of(np.mean, self.iou),
-            "iou_std": _of(np.std, self.iou),
-            "iou_median": _of(np.median, self.iou),
-            "iou_min": _of(np.min, self.iou),
-            "iou_max": _of(np.max, self.iou),
+            **_statistics("iou", self.iou, np.mean, np.std, np.median, np.min, np.max),
             "over_85": _of(np.mean, self.iou > GOOD_IOU),
-            "volume_iou_mean": _of(np.mean, self.volume_iou),
-            "volume_iou_std": _of(np.std, self.volume_iou),
+            **_statistics("volume_iou", self.volume_iou, np.mean, np.std),
             "delta_a": _of(np.mean, self.delta_a[recovered]),
             "delta_e": _of(np.mean, self.delta_e[recovered]),
             "delta_t": [_of(np.mean, coordinate) for coordinate in self.delta_t[recovered].T],
@@ -143,9 +129,7 @@ class FiguresOfMerit:
             "symmetric_angle_median": _of(np.median, self.symmetric_angle[recovered]),
             "any_order_angle_median": _of(np.median, self.any_order_angle[recovered]),
             "timed": times.size,
-            "milliseconds_mean": _of(np.mean, times),
-            "milliseconds_std": _of(np.std, times),
-            "milliseconds_median": _of(np.median, times),
+            **_statistics("milliseconds", times, np.mean, np.std, np.median),
             "milliseconds_p95": _of(lambda values: np.percentile(values, 95), times),
         }
 
@@ -154,6 +138,10 @@ def shortest_arc(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Angle 0 to 2 pi of the rotation from predicted to true quaternions (..., 4), signs as they are (figure 6.3)."""
     between = quaternions.multiply(quaternions.conjugate(predicted), true)
     return 2 * np.arctan2(np.linalg.norm(between[..., :3], axis=-1), between[..., 3])
+
+
+def _statistics(name: str, values: np.ndarray, *statistics: Callable[[np.ndarray], np.floating]) -> dict[str, float]:
+    return {f"{name}_{statistic.__name__}": _of(statistic, values) for statistic in statistics}
 
 
 def _of(statistic: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:

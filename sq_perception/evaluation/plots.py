@@ -1,4 +1,4 @@
-"""What all pictures have: figures and colours, the depth image, masks, reprojected outlines, grasps.
+"""Parts of all pictures: figures and colours, the depth image, masks, reprojected outlines, grasps.
 
 Drawing functions take a Matplotlib axes; figures are made with the object interface and the Agg canvas, so that
 nothing here touches a display or a global state.  Images are in pixels with centres at integers, bodies in the optical

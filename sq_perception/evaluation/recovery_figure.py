@@ -1,4 +1,4 @@
-"""The whole story of one recovered frame in one picture, and the numbers of its bodies."""
+"""One picture of a recovered frame: input, masks, outlines, views from two sides, and the numbers of its bodies."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MOST_LISTED = 8
 
 
 def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, title: str = "") -> Figure:
-    """The whole story of one frame: input and masks, outlines on the depth picture, two 3D views, numbers.
+    """Input and masks, outlines on the depth image, two 3D views, numbers.
 
     A body has the same number, its place in ``recovery.bodies``, wherever it is drawn.  Lengths are metres, or sides of
     the unit cube, which an orthographic camera sees.

@@ -1,8 +1,8 @@
-"""From where a parallel gripper may come to a body, and where along it its pads may be.
+"""Approaches of a parallel gripper to a body, and the places of its pads along them.
 
-A closing is a direction y of a body along which it is narrow enough and whose opposite surfaces are met squarely.  The
-hand comes to it along z, across y: as steeply as possible, or swung about y.  With x the cross product of y and z the
-TCP is at
+A closing is a direction y along which a body is narrow enough and whose opposite surfaces are met squarely.  The hand
+approaches along z, perpendicular to y: as steeply as possible, or swung about y.  With x the cross product of y and z
+the TCP is at
 
     t + u z + v x,    t the body's centre, u how far ahead of it (deepest, shallow, between), v how far along it.
 
@@ -23,7 +23,7 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
 
 _TOO_WIDE = 0.8
-"""Sigmas of a body's width by which it may exceed the opening and is tried still: beyond, it would fit once in five."""
+"""Sigmas of a body's width by which it may exceed the opening: beyond, it would fit less than once in five times."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
 """Turns of the approach about the closing line, away from the steepest one."""
 _STEEP = 0.3
@@ -49,7 +49,7 @@ class Closings(NamedTuple):
 
 
 class Approaches(NamedTuple):
-    """Closings and the sides to come to them from, k of them.
+    """k closings, each with a direction of approach.
 
     Attributes
     ----------
@@ -126,7 +126,7 @@ def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings
 def from_every_side(
     bodies: KnownBodies, found: Closings, gripper: Gripper, around: Surroundings, placement: float
 ) -> Approaches:
-    """Every closing from every side, but from below; ``placement`` is how sure the hand's place is, metres."""
+    """Every closing from every side except from below; ``placement`` is the standard deviation of the hand, metres."""
     y = np.repeat(found.along, len(_SWINGS), axis=0)
     owner = np.repeat(found.owner, len(_SWINGS))
     half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (found.reach, found.sigma))

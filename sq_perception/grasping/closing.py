@@ -74,7 +74,10 @@ class KnownBodies:
         ValueError
             For covariances of another shape.
         """
-        flat, turns = np.ascontiguousarray(bodies.to_numbers(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
+        flat, turns = (
+            np.ascontiguousarray(bodies.to_numbers(), dtype=float),
+            np.ascontiguousarray(bodies.rotation_matrix),
+        )
         wide = np.zeros((len(flat), 9))
         wide[:, :3] = UNKNOWN * bodies.size
         wide[:, 3:6] = UNKNOWN * bodies.size.mean(axis=1, keepdims=True)

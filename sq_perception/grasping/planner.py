@@ -138,7 +138,7 @@ def grasps(
 
 
 def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
-    """Which bodies (n,) do not even reach the plane from behind."""
+    """Which bodies (n,) lie wholly behind the plane."""
     if plane is None:
         return np.zeros(len(bodies), dtype=bool)
     top, _ = bodies.reaches(np.arange(len(bodies)), np.tile(plane[:3], (len(bodies), 1)))
@@ -146,7 +146,7 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
 
 
 def _probable(trials: Trials, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """The ``count`` best of each body that has any; what the best of the others suffer from is their reason."""
+    """The ``count`` best of each body that has any; the weakest margin of the best one is the reason of the others."""
     found = trials.first(count, np.log(_LEAST))
     without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
@@ -242,7 +242,7 @@ def _among_others(
 
 
 def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
-    """Let sides and near ends count as far as the image does not show that they are not there; points tell the rest."""
+    """Count sides and near ends only as far as the image does not show that they are empty; points tell the rest."""
     turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
     hidden = around.hidden(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
     shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(log_phi(gap + PASSES, np.hypot(SIDE_SIGMA, placement)))

@@ -1,4 +1,4 @@
-"""What is around the bodies: the table, what else was measured, and where nobody has looked."""
+"""What surrounds the bodies: the table, other measured points, and space that was not seen."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _ABOVE = 0.008
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """All that a gripper has to mind beside the bodies, in their frame.
+    """All that a gripper has to avoid beside the bodies, in their frame.
 
     Attributes
     ----------

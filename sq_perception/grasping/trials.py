@@ -1,4 +1,4 @@
-"""Grasps under trial: the probabilities of their margins, and what all ways of grasping have in common.
+"""Candidate grasps: the probabilities of their margins, and what all ways of grasping have in common.
 
 Metres, newtons, kilograms.
 """
@@ -34,7 +34,7 @@ _PAD_RADIUS = 0.006
 
 
 class Trials(NamedTuple):
-    """Grasps under trial, k of them, and the logarithm of the probability of each margin so far.
+    """k candidate grasps and the logarithm of the probability of each margin so far.
 
     ``sides`` (k, 2) are those of the two sides that the fingers pass, whose sum is the margin of the opening.
     """
@@ -70,7 +70,6 @@ class Trials(NamedTuple):
         owner = self.owner[rows]
         rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
         return self.at(rows[rank < count])
-
 
 
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:

@@ -18,13 +18,10 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state
-from sq_perception.tracking.state import LENGTH, POSE, SHAPE, SIZE, TURN
+from sq_perception.tracking.state import HAND, LENGTH, POSE, SHAPE, SIZE, TURN
 
 EXCHANGE = 0.5
 """Chosen: the exponents of fitted boxes and ovals differ by less, those of cylinders by more."""
-_HAND = 0.5
-"""Standard deviation, radians, of how a body may have been rotated while its track did not follow it.  Chosen: 90
-degrees cost as much as three deviations of size."""
 
 
 def _rotations() -> np.ndarray:
@@ -80,7 +77,7 @@ def nearest(
 def loosen_pose(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Covariances (n, 11, 11) of bodies that were carried by ``distance`` (n,) metres and may have been rotated."""
     variance = np.zeros((len(covariance), LENGTH))
-    variance[:, POSE] = np.concatenate([np.tile(distance[:, None], 3), np.full((len(covariance), 3), _HAND)], axis=1)
+    variance[:, POSE] = np.concatenate([np.tile(distance[:, None], 3), np.full((len(covariance), 3), HAND)], axis=1)
     return covariance + variance[:, :, None] ** 2 * np.eye(LENGTH)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.tracking import state as states
 from sq_perception.tracking.fusion import Estimate
-from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN
+from sq_perception.tracking.state import CENTRE, HAND, LENGTH, POSE, TURN
 
 DRIFT = states.diagonal(0.0, 0.0, 0.001, 0.01)
 """Random walk of a body at rest in a second: a millimetre, and 0.6 degrees.  Chosen."""
@@ -22,8 +22,6 @@ CONFIRM_AFTER = 3
 """Observations until a track is confirmed: one more than may disagree by chance.  Chosen."""
 FORGET_POSE_AFTER = 5.0
 """Seconds without observation until a body may be anywhere within reach.  Chosen."""
-HAND = 1.0
-"""Metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down."""
 _COASTING = 1.0
 """Seconds that an unseen body is taken to go on as it was seen to move.  Chosen."""
 

@@ -30,8 +30,8 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.tracking import association, fusion, gating, state, visibility
 from sq_perception.tracking.association import Pairs
 from sq_perception.tracking.fusion import Estimate, Observation
-from sq_perception.tracking.state import CENTRE, LENGTH, TURN, Observed
-from sq_perception.tracking.track import CONFIRM_AFTER, HAND, Body, Track, TrackState, stack
+from sq_perception.tracking.state import CENTRE, HAND, LENGTH, TURN, Observed
+from sq_perception.tracking.track import CONFIRM_AFTER, Body, Track, TrackState, stack
 
 __all__ = ["Track", "TrackState", "Tracker"]
 
@@ -340,9 +340,8 @@ def _velocity(body: Body, error: np.ndarray, slid: bool, stamp: float, covarianc
         return body.velocity
     if body.is_moving:
         velocity = body.velocity + 0.5 * error / elapsed
-        noise = float(np.sqrt(np.trace(covariance)))
-        still = max(gating.STILL_SHARE * float(body.estimate.state[0:3].mean()), 0.5 * noise)
-        return velocity if np.linalg.norm(velocity) * elapsed > still else np.zeros(3)
+        is_noise = np.linalg.norm(velocity) * elapsed < 0.5 * np.sqrt(np.trace(covariance))
+        return np.zeros(3) if is_noise else velocity
     if slid and body.jumps != 1:
         velocity = error / elapsed
         return velocity * min(1.0, HAND / float(np.linalg.norm(velocity)))

@@ -50,7 +50,7 @@ def test_what_repeats_all_bodies_gives_what_a_comparison_gives(monkeypatch):
     quick, thorough, repeated, shortcuts = Tracker(), Tracker(), tracker_module._repeat, []
     monkeypatch.setattr(tracker_module, "_repeat", lambda *some: shortcuts.append(repeated(*some)) or shortcuts[-1])
     seen, pose = [draw(each, noise(), rng) for each in bodies], (np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    for k in range(200):
+    for k in range(100):
         happens = rng.random()
         if happens < 0.1:
             seen = [draw(each, noise(), rng) for each in bodies]
@@ -65,15 +65,11 @@ def test_what_repeats_all_bodies_gives_what_a_comparison_gives(monkeypatch):
             patch.setattr(tracker_module, "_repeat", lambda *_: None)
             compared = thorough.update(shown, 0.05 * k, pose)
         for one, other in zip(tracks, compared, strict=True):
-            assert (one.id, one.seen, one.state, one.observation) == (
-                other.id,
-                other.seen,
-                other.state,
-                other.observation,
-            )
+            facts = [(each.id, each.seen, each.state, each.observation) for each in (one, other)]
+            assert facts[0] == facts[1]
             np.testing.assert_array_equal(one.superquadric.to_flat(), other.superquadric.to_flat())
             np.testing.assert_array_equal(one.covariance, other.covariance)
-    assert sum(each is not None for each in shortcuts) > 50
+    assert sum(each is not None for each in shortcuts) > 25
 
 
 @pytest.mark.parametrize("same", [True, False])
