@@ -16,7 +16,6 @@ from sq_msgs_py.depth_image import depth_to_message
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.frame import decode, image_topic
-from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.recordings.publication import size_of
 
 

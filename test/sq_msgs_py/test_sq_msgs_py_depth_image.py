@@ -18,7 +18,6 @@ from sq_msgs_py.depth_image import ImageError, Intrinsics
 from sq_perception.recordings import publication
 
 
-
 def depth_from_message(message: Image) -> np.ndarray:
     return publication.depth_of(message, is_cube=False)[0].depth
 
