@@ -3,10 +3,10 @@
 Whatever the format (:mod:`sq_perception.recordings.camera_document`), K is looked for by its usual names: in one
 number each (fx, fl_x, Camera.fx ...; cx, ppx ...), in four (``intrinsics`` of Kalibr), or in a matrix (K, cam_K,
 camera_matrix, intrinsic_matrix ...), row by row or, as the last row of K shows, column by column.  That reads
-camera_calibration's YAML and printed camera_info messages, OpenCV's FileStorage, librealsense, Open3D, BOP (camera.json,
-and scene_camera.json by the number of the image), Kalibr, NeRF's transforms.json, COLMAP, ORB-SLAM, ScanNet, Record3D,
-``.intr`` and texts.  Of several cameras the one of the image's size counts, and depth before colour.  Beside files,
-``525,525,319.5,239.5`` is fx, fy, cx, cy.
+camera_calibration's YAML and printed camera_info messages, OpenCV's FileStorage, librealsense, Open3D, BOP
+(camera.json, and scene_camera.json by the number of the image), Kalibr, NeRF's transforms.json, COLMAP, ORB-SLAM,
+ScanNet, Record3D, ``.intr`` and texts.  Of several cameras the one of the image's size counts, and depth before colour.
+Beside files, ``525,525,319.5,239.5`` is fx, fy, cx, cy.
 
 Where no size is stated, it is the image's.  A stated unit of depths (depth_scale, DepthMapFactor ...) comes along.
 
@@ -79,7 +79,8 @@ _OF_WHAT = ("m", "camera", "cam", "image", "img", "calibration", "rgbd", "intege
 _COLOUR = ("color", "colour", "rgb")
 _LENSES = {
     **dict.fromkeys(("", "none", "pinhole", "simple pinhole", "plumb bob", "radtan", "opencv", "simple radial",
-                     "radial", "perspective", "brown conrady", "inverse brown conrady", "modified brown conrady"), "plumb_bob"),
+                     "radial", "perspective", "brown conrady", "inverse brown conrady", "modified brown conrady"),
+                    "plumb_bob"),
     **dict.fromkeys(("rational polynomial", "full opencv"), "rational_polynomial"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencv fisheye", "kannala brandt", "kannala brandt4",
                      "kannala brandt8"), "equidistant"),
@@ -104,7 +105,7 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """The fields of a sensor_msgs/CameraInfo, from a file, with flat matrices; ``unit`` is that of depths, if stated."""
+    """The fields of a sensor_msgs/CameraInfo, from a file, with flat matrices; ``unit``: that of depths, if stated."""
 
     width: int
     height: int
