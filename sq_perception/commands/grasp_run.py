@@ -25,6 +25,7 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 from sq_perception.recordings.inputs import RecordedInput
+from sq_perception.recordings.result_json import plain_name
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer, Recovery
 
@@ -97,7 +98,7 @@ def _plan_all(
                 code = failed(f"{file}: {frame.name}: {error}")
                 continue
             stamp = None if frame.stamp is None else frame.stamp._asdict()
-            entries.append({"file": file, "stamp": stamp, "bodies": bodies})
+            entries.append({"file": plain_name(file), "stamp": stamp, "bodies": bodies})
     except KeyboardInterrupt:
         complain("interrupted; what is done so far is kept")
         return console.INTERRUPTED, False

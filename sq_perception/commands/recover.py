@@ -29,12 +29,13 @@ Recover superquadrics from recorded depth images.
 A FRAME is
   .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
                  then used instead of an own segmentation
-  an image       PNG or TIFF of 16 bit (millimetres), TIFF, NPY or EXR (extra 'exr') of floats (metres), or see
-                 --depth-scale; 0 = no reading; with --camera-info, a camera file beside it, or a YAML of its name
+  an image       PNG, TIFF or NPY of 16 bit (millimetres), TIFF, NPY or EXR (extra 'exr') of floats (metres), or see
+                 --depth-scale; 0 = no reading, as is the type's largest number, and what many pixels share beyond all
+                 others; with --camera-info, a camera file beside it, or a YAML of its name
   .pcd, .ply     a point cloud in the optical frame; a PCD that is an image of a pinhole camera is taken as one
   .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
-  a folder       all frames in it, in natural order, or those of its subfolders where it has none; camera_info.yaml,
-                 camera.yaml, intrinsics.json or camera_intrinsic.json in it is the camera of its images
+  a folder       all frames in it, in natural order, or those of its subfolders (four levels) where it has none;
+                 camera_info.yaml, camera.json, scene_camera.json, intrinsics.json ... in it is their camera
   a rosbag2      a folder with metadata.yaml, or a .mcap or .db3 file: 16UC1 and 32FC1 images, raw or compressedDepth,
                  with the camera_info beside their topic, and masks on mask/image; needs no ROS, but the extra 'bags'
 
@@ -70,6 +71,10 @@ files:
   a body, with the same numbers.  Positions are in the optical frame (x right, y down, z forward); those of orthographic
   frames in the unit cube (x right, y up, z to the viewer).  A file whose name is a time (1305031102.160407.png) has
   that stamp.
+
+camera files:
+  K as camera_info, OpenCV, librealsense, Open3D, BOP, Kalibr, NeRF, COLMAP, ORB-SLAM, ScanNet and others write it, or a
+  text or NPZ of K or fx fy cx cy.  The size is the image's where the file has none.  A depth_scale in it is used.
 
 distortion:
   Where a camera_info has distortion coefficients that are not zero, --distortion auto takes images for rectified if the

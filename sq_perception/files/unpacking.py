@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import io
 import math
+import struct
 import warnings
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import IO
@@ -25,6 +27,7 @@ MOST_PIXELS = 2**25
 """Pixels of an image, or numbers of an array: no depth camera has more."""
 MOST_BYTES = 2**28
 """Bytes of a packed file."""
+_PNG = b"\x89PNG\r\n\x1a\n"
 
 
 class UnpackingError(ValueError):
@@ -80,7 +83,7 @@ def grey_image(path: Path) -> np.ndarray:
     if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
         raise UnpackingError(f"not a readable image: expected 1 to {MOST_PIXELS} pixels, got {width} x {height}")
     try:
-        image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(_plain_png(encoded) if encoded[:8].tobytes() == _PNG else encoded, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise UnpackingError(f"not a readable image: {error.err}") from error
     if image is None:
@@ -144,6 +147,25 @@ def _numbers(file: IO[bytes], file_size: int, where: str = "") -> np.ndarray:
     if file_size != file.tell() + size:
         raise UnpackingError(f"{where}expected {size} bytes of numbers, got {file_size - file.tell()}")
     return np.frombuffer(file.read(size), dtype).reshape(shape, order="F" if is_fortran else "C").copy()
+
+
+def _plain_png(encoded: np.ndarray) -> np.ndarray:
+    """A PNG's pixels alone, without profiles and texts: its decoder writes on the standard error what it finds there.
+
+    Raises UnpackingError where a part is missing or damaged, for the same reason.
+    """
+    data, at, kept = encoded.tobytes(), len(_PNG), [_PNG]
+    while at + 12 <= len(data):
+        length, name = struct.unpack_from(">I4s", data, at)
+        end = at + 12 + length
+        if end > len(data) or zlib.crc32(data[at + 4 : end - 4]) != struct.unpack_from(">I", data, end - 4)[0]:
+            break
+        if name in (b"IHDR", b"PLTE", b"IDAT", b"IEND"):
+            kept.append(data[at:end])
+        if name == b"IEND":
+            return np.frombuffer(b"".join(kept), np.uint8)
+        at = end
+    raise UnpackingError("not a readable image: a part of the PNG is missing or damaged")
 
 
 def _image_header(encoded: np.ndarray) -> tuple[int, int, bool]:

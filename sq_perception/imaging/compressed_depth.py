@@ -54,8 +54,8 @@ def size(image_format: str, data: bytes | np.ndarray) -> tuple[int, int]:
 
 
 def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
-    """The numbers of the image before it was packed (height, width): uint16 of 16UC1, float32 metres of 32FC1, 0 and NaN
-    for nothing.
+    """The numbers (height, width) of the image before it was packed: uint16 of 16UC1, 0 for nothing, or float32 metres
+    of 32FC1, NaN for nothing.
 
     Parameters
     ----------

@@ -4,15 +4,15 @@
     z = range / |((u - cx) / fx, (v - cy) / fy, 1)|
 
 The scale is the caller's; else the one that a file or camera states; else 1000 for whole numbers and 1 for floats (REP
-118).  No reading are 0, negative numbers, NaN, infinity, and
+118).  No reading are 0, negative numbers, NaN, what is beyond 100 km, and
 
 - the largest number that an integer, or half precision, holds;
 - a number that many pixels share exactly, beyond all other readings by a fifth, if programs use it for this (2^k - 1,
   10 000 or 100 000, as it stands, or in millimetres), or a tenth of its pixels are holes in surfaces.
 
-So a flat wall, a floor seen from straight above, quantised depths and readings that a sensor clips at its range stay what
-they are: the first two lie around things and not in them, the others have readings just before them.  Orthographic grey
-values never come here.
+So a flat wall, a floor seen from straight above, quantised depths and readings that a sensor clips at its range stay
+what they are: the first two lie around things and not in them, the others have readings just before them.  Orthographic
+grey values never come here.
 
 A Kinect's raw disparities (11 bit, 2047 = nothing) look like millimetres.  They are linear in the pixels of a plane,
 where a depth image has a linear 1/z; an image of them is refused.
@@ -29,7 +29,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from sq_perception.imaging.camera import GREATEST_MEDIAN, LEAST_MEDIAN, Camera
+from sq_perception.imaging.camera import GREATEST_DEPTH, GREATEST_MEDIAN, LEAST_MEDIAN, Camera
 
 DepthKind = Literal["z", "range"]
 """What a depth image holds: z along the optical axis, or the distance to the camera's centre along each ray."""
@@ -110,7 +110,7 @@ def metres(numbers: np.ndarray, scale: float | None = None, known: Stated | None
         notes.append(f"{used:.6g} units are a metre: {known.source}")
     with np.errstate(all="ignore"):  # of what is no number, or none that a float holds
         depth = (numbers if used == 1 else np.divide(numbers, used, dtype=float)).astype(np.float32)
-        none = ~((depth > 0) & (depth < np.inf))
+        none = ~((depth > 0) & (depth <= GREATEST_DEPTH))
     if is_whole or numbers.dtype.itemsize == 2:
         largest = np.iinfo(numbers.dtype).max if is_whole else np.finfo(numbers.dtype).max
         saturated = numbers == largest

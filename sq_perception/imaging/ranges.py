@@ -4,9 +4,9 @@ With r the ray (x, y, 1) of a pixel and a plane n.p + d = 0, the number v of its
 
     1/v = a.r / |r|^k            k = 0: z,   k = 1: range,   a = -n / d
 
-linear in a for each k.  The plane with most readings is sought for both; ranges are those where k = 1 has clearly more of
-them and k, fitted to them, is 1.  A table that really bends by 1 or 2 % of its length has k = 0.3 at the most: where a
-support spans so little of the image that less would do, nothing is said.
+linear in a for each k.  The plane with most readings is sought for both; ranges are those where k = 1 has clearly more
+of them and k, fitted to them, is 1.  A table that itself bends by 1 or 2 % of its length is none of them, and where the
+support spans so little of the image that such a bend would do, nothing is said.
 """
 
 from __future__ import annotations

@@ -176,5 +176,3 @@ def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInf
 def stamp_of(message: Any) -> int:
     """Nanoseconds of a message's header.  Not by rclpy's Time, which refuses stamps before 1970."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
-
-

@@ -13,8 +13,9 @@ Label images on the one topic that is called ``mask/image``, with or without a n
 images with their stamps; they may have been recorded later, and in another order.  Of several such topics none is
 taken, and frames say so.
 
-The camera is that of one topic (:mod:`sq_perception.recordings.bag_camera`): the message with the image's stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
-topic decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
+The camera is that of one topic (:mod:`sq_perception.recordings.bag_camera`): the message with the image's stamp;
+failing that, the last one before the image; failing that, the bag's first, however late.  The name of the images' topic
+decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
 
 A bag may be damaged or hostile (:mod:`sq_perception.recordings.bag_reader`); pixels are only allocated for data that
 is there.

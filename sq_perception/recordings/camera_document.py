@@ -1,7 +1,7 @@
 """What a file about a camera holds, as mappings of plain data, whatever its format.
 
-YAML, JSON, OpenCV's FileStorage, COLMAP's cameras.txt, lines of ``name: value`` or ``name = value``, NPZ and NPY; a text
-of nothing but 4, 9, 12 or 16 numbers is fx fy cx cy, or a matrix K row by row, or a larger one around it.
+YAML, JSON, OpenCV's FileStorage, COLMAP's cameras.txt, lines of ``name: value`` or ``name = value``, NPZ and NPY; a
+text of nothing but 4, 9, 12 or 16 numbers is fx fy cx cy, or a matrix K row by row, or a larger one around it.
 """
 
 from __future__ import annotations
@@ -85,9 +85,7 @@ def _matrix(numbers: np.ndarray) -> dict[str, Any]:
     """K, or the larger matrix around it, or four numbers."""
     shape = _SHAPES.get(numbers.size)
     if shape is None or numbers.dtype.kind not in "fiu" or numbers.shape not in (shape, (numbers.size,)):
-        raise ValueError(
-            f"expected four numbers (fx fy cx cy) or 3 x 3 of them, got {numbers.dtype} {numbers.shape}"
-        )
+        raise ValueError(f"expected four numbers (fx fy cx cy) or 3 x 3 of them, got {numbers.dtype} {numbers.shape}")
     return {"k": numbers.reshape(shape).tolist()}
 
 
@@ -109,7 +107,7 @@ def _of_colmap(text: str) -> dict[str, Any] | None:
 
 
 def _of_lines(text: str) -> dict[str, Any]:
-    """``name: value`` and ``name = value``; any other line is the title of those that follow.  Empty without numbers."""
+    """``name: value`` and ``name = value``; another line is the title of those that follow.  Empty without numbers."""
     has_numbers = False
     top: dict[str, Any] = {}
     section = top

@@ -1,12 +1,12 @@
 """The camera of recorded images: a camera_info YAML, or intrinsics as other tools write them.
 
-Whatever the format (:mod:`sq_perception.recordings.camera_document`), K is looked for by its usual names: in one number
-each (fx, fl_x, Camera.fx ...; cx, ppx ...), in four (``intrinsics`` of Kalibr), or in a matrix (K, cam_K, camera_matrix,
-intrinsic_matrix ...), row by row or, as the last row of K shows, column by column.  That reads camera_calibration's
-YAML and printed camera_info messages, OpenCV's FileStorage, librealsense, Open3D, BOP (camera.json, and scene_camera.json
-by the number of the image), Kalibr, NeRF's transforms.json, COLMAP, ORB-SLAM, ScanNet, Record3D, ``.intr`` and texts.
-Of several cameras the one of the image's size counts, and depth before colour.  Beside files, ``525,525,319.5,239.5`` is
-fx, fy, cx, cy.
+Whatever the format (:mod:`sq_perception.recordings.camera_document`), K is looked for by its usual names: in one
+number each (fx, fl_x, Camera.fx ...; cx, ppx ...), in four (``intrinsics`` of Kalibr), or in a matrix (K, cam_K,
+camera_matrix, intrinsic_matrix ...), row by row or, as the last row of K shows, column by column.  That reads
+camera_calibration's YAML and printed camera_info messages, OpenCV's FileStorage, librealsense, Open3D, BOP
+(camera.json, and scene_camera.json by the number of the image), Kalibr, NeRF's transforms.json, COLMAP, ORB-SLAM,
+ScanNet, Record3D, ``.intr`` and texts.  Of several cameras the one of the image's size counts, and depth before colour.
+Beside files, ``525,525,319.5,239.5`` is fx, fy, cx, cy.
 
 Where no size is stated, it is the image's.  A stated unit of depths (depth_scale, DepthMapFactor ...) comes along.
 
@@ -59,13 +59,14 @@ _NAMES = {
     **dict.fromkeys(("cy", "c y", "ppy", "center y", "principal point y"), _CY),
     **dict.fromkeys(("f", "focal", "focal length"), "f"),
     **dict.fromkeys(("pp", "principal point"), "pp"),
-    **dict.fromkeys(("matrix", "k", "intrinsic", "intrinsics", "intrinsic matrix", "intrinsics matrix", "mtx"), _MATRIX),
+    **dict.fromkeys(("matrix", "k", "intrinsic", "intrinsics", "intrinsic matrix", "intrinsics matrix", "mtx"),
+                    _MATRIX),
     **dict.fromkeys(("projection matrix", "p"), _PROJECTION),
     **dict.fromkeys(("width", "w"), _WIDTH),
     **dict.fromkeys(("height", "h"), _HEIGHT),
     **dict.fromkeys(("resolution", "size"), _SIZE),
-    **dict.fromkeys(("distortion coefficients", "distortion coeffs", "distortion", "d", "coeffs", "dist coeffs", "dist coefs",
-                     "dist"),
+    **dict.fromkeys(("distortion coefficients", "distortion coeffs", "distortion", "d", "coeffs", "dist coeffs",
+                     "dist coefs", "dist"),
                     _COEFFICIENTS),
     "distortion model": _LENS,
     "model": _MODEL,
@@ -77,8 +78,9 @@ _WORDS = re.compile(r"[A-Z]?[a-z]+\d*|[A-Z]+(?![a-z])\d*|\d+")
 _OF_WHAT = ("m", "camera", "cam", "image", "img", "calibration", "rgbd", "integer", "ir")
 _COLOUR = ("color", "colour", "rgb")
 _LENSES = {
-    **dict.fromkeys(("", "none", "pinhole", "simple pinhole", "plumb bob", "radtan", "opencv", "simple radial", "radial",
-                     "perspective", "brown conrady", "inverse brown conrady", "modified brown conrady"), "plumb_bob"),
+    **dict.fromkeys(("", "none", "pinhole", "simple pinhole", "plumb bob", "radtan", "opencv", "simple radial",
+                     "radial", "perspective", "brown conrady", "inverse brown conrady", "modified brown conrady"),
+                    "plumb_bob"),
     **dict.fromkeys(("rational polynomial", "full opencv"), "rational_polynomial"),
     **dict.fromkeys(("equidistant", "equi", "fisheye", "opencv fisheye", "kannala brandt", "kannala brandt4",
                      "kannala brandt8"), "equidistant"),
@@ -103,7 +105,7 @@ class Region:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat.  ``unit`` is that of depths, if stated."""
+    """The fields of a sensor_msgs/CameraInfo, from a file, with flat matrices; ``unit``: that of depths, if stated."""
 
     width: int
     height: int

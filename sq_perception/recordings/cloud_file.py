@@ -76,7 +76,7 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     with np.errstate(invalid="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
         before = there & (points[..., 2] > LEAST_DEPTH) & (points[..., 2] < GREATEST_DEPTH)
-    count = np.count_nonzero(there)
+    count = int(np.count_nonzero(there))
     with np.errstate(all="ignore"):
         near = before & (np.abs(points[..., :2]).max(axis=2) < _WIDEST * points[..., 2])
     behind, off = (float(np.count_nonzero(some)) / max(count, 1) for some in (there & ~before, before & ~near))

@@ -2,8 +2,9 @@
 
 A folder gives its frames and bags in natural order (frame_2 before frame_10), by their times where all names are times,
 NPYs only where it has nothing else, as matrices of calibrations are such files too; one without any gives those of its
-subfolders.  The camera of its images, and of an image that is named by itself, is ``camera_info.yaml``,
-one of the other ``camera_file.CAMERA_FILES`` beside it, or in the folder that was named, else the YAML of its own name.
+subfolders, down to four levels, or of the one called depth.  The camera of its images, and of an image that is named
+by itself, is one of ``camera_file.CAMERA_FILES`` beside it or in the folder that was named, else the YAML of its own
+name.
 What cannot be read comes as an error with the reason, in its place, and the rest follows.
 """
 
@@ -27,6 +28,8 @@ _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 _log = logging.getLogger(__name__)
 ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
+_LEVELS = 4
+"""Levels of folders below the one that was named: a benchmark's are set, scene and depth."""
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -94,10 +97,13 @@ class RecordedInput:
                 return [(path, self._options.camera_info or camera_beside(path))]
         except OSError as error:  # a folder that may not be looked into, a name that is too long
             return [(path, FrameError(str(error)))]
-        nothing = FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})")
-        return self._in_folders(path, None) or [(path, nothing)]
+        self._are_deeper = False
+        found = self._in_folders(path, None)
+        if self._are_deeper:
+            _log.warning("%s: folders in it are looked into for %d levels, and not farther down", path, _LEVELS)
+        return found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
 
-    def _in_folders(self, folder: Path, above: str | Path | None) -> list[_Source]:
+    def _in_folders(self, folder: Path, above: str | Path | None, levels: int = _LEVELS) -> list[_Source]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
         try:
             camera_info = self._options.camera_info or camera_in(folder) or above
@@ -108,7 +114,11 @@ class RecordedInput:
             folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
         except OSError as error:
             return [(folder, FrameError(f"{folder}: {error}"))]
-        return [one for inner in sorted(folders, key=_natural) for one in self._in_folders(inner, camera_info)]
+        if folders and levels == 0:
+            self._are_deeper = True
+            return []
+        folders = [inner for inner in folders if inner.name.lower() == "depth"] or sorted(folders, key=_natural)
+        return [one for inner in folders for one in self._in_folders(inner, camera_info, levels - 1)]
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:
@@ -145,4 +155,3 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     """Numbers in a name count as numbers: every second part is one."""
     parts = _DIGITS.split(path.name.lower())
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
-

@@ -44,7 +44,8 @@ class ResumeError(ValueError):
 def head(options: Mapping[str, Any]) -> dict[str, Any]:
     """What both forms begin with; ``options`` are those that decide what is found."""
     program = f"sq_perception {__version__}"
-    return {"format": FORMAT, "version": VERSION, "program": program, "units": UNITS, "options": dict(options)}
+    plain = {name: plain_name(value) if isinstance(value, str) else value for name, value in options.items()}
+    return {"format": FORMAT, "version": VERSION, "program": program, "units": UNITS, "options": plain}
 
 
 def frame_entry(
@@ -70,7 +71,7 @@ def frame_entry(
             }
         )
     entry = {
-        "file": file,
+        "file": plain_name(file),
         "ms": recovery.milliseconds["total"],
         "superquadrics": bodies,
         "coordinates": "cube" if frame.is_cube else "optical",
@@ -92,6 +93,11 @@ def frame_entry(
     text = json.dumps(entry, default=lambda value: value.tolist())
     plain: dict[str, Any] = json.loads(text, parse_constant=lambda _: None)
     return plain
+
+
+def plain_name(file: str) -> str:
+    r"""The name of a file as text that every program reads: ``\xe9`` for a byte that is no UTF-8."""
+    return file.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
 def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
@@ -280,7 +286,7 @@ class Recovered:
 
     def __call__(self, file: str, topic: str, stamp: Stamp | None) -> bool:
         """Whether this frame is one of them; it is then ticked off."""
-        key = _key(file, topic, None if stamp is None else stamp._asdict())
+        key = _key(plain_name(file), topic, None if stamp is None else stamp._asdict())
         found = self._left[key] > 0
         if found:
             self._left[key] -= 1

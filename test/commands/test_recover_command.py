@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
+import struct
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import cv2
@@ -118,6 +123,71 @@ def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch
     found = list(RecordedInput([str(tmp_path)]))
     assert [Path(source).relative_to(tmp_path).parts[0] for source, _ in found] == ["a", "b", "c"]
     assert [isinstance(frame, FrameError) for _, frame in found] == [False, True, False]
+
+
+def test_folders_are_looked_into_to_a_depth_that_is_said(tmp_path, caplog):
+    near, far = tmp_path / "1/2/3/4", tmp_path / "a/b/c/d/e"
+    for folder in (near, far):
+        folder.mkdir(parents=True)
+        save_npz(folder / "f.npz")
+    with caplog.at_level("WARNING"):
+        found = RecordedInput([str(tmp_path)])
+    assert [file for file, _ in found] == [str(near / "f.npz")]
+    assert "for 4 levels, and not farther down" in caplog.text
+
+
+def test_a_folder_of_depth_images_stands_for_its_siblings(tmp_path):
+    for folder in ("depth", "mask", "rgb"):
+        (tmp_path / folder).mkdir()
+        save_npz(tmp_path / folder / "f.npz")
+    assert [file for file, _ in RecordedInput([str(tmp_path)])] == [str(tmp_path / "depth" / "f.npz")]
+
+
+def test_names_that_are_no_utf_8_are_valid_json_and_are_resumed(tmp_path, capsys):
+    name = os.fsdecode(b"caf\xe9.npz")
+    save_npz(tmp_path / name)
+    lines = tmp_path / "out.jsonl"
+    for _ in range(2):
+        recover(tmp_path, tmp_path / name, "--jsonl", lines)
+    assert "0 frames, 0 objects (0 failed), 1 frame in" in capsys.readouterr().err, "the second time it is done"
+    text = lines.read_text(encoding="utf-8")
+    assert "\\ud" not in text, "half a surrogate pair, which other programs refuse"
+    assert json.loads(text.splitlines()[1])["file"].endswith(r"caf\xe9.npz")
+
+
+def test_decoders_write_nothing_themselves(tmp_path):
+    """Of damaged files, and of what they hold beside pixels: a process of its own, as they write past Python."""
+    image = np.full((48, 64), 800, np.uint16)
+    whole = cv2.imencode(".png", image)[1].tobytes()
+    profile = b"iCCPgarbage"
+    chunk = struct.pack(">I", len(profile) - 4) + profile + struct.pack(">I", zlib.crc32(profile))
+    damaged = bytearray(whole)
+    damaged[-20] ^= 255
+    tiff = bytearray(cv2.imencode(".tiff", image)[1].tobytes())
+    tiff[-30] ^= 255
+    for name, data in {
+        "profile.png": whole[:33] + chunk + whole[33:],
+        "cut.png": whole[:-30],
+        "damaged.png": damaged,
+        "odd.tiff": tiff,
+    }.items():
+        (tmp_path / name).write_bytes(data)
+    code = "from sq_perception.commands.main import main; main()"
+    command = [
+        sys.executable,
+        "-c",
+        code,
+        "recover",
+        tmp_path,
+        "--camera-info",
+        "60,60,31.5,23.5",
+        "--method",
+        "symmetry",
+    ]
+    errors = subprocess.run(command, capture_output=True, text=True).stderr.splitlines()
+    assert errors
+    assert all(line.startswith("sq-perception: ") for line in errors), errors
+    assert sum("not a readable image" in line for line in errors) >= 2
 
 
 def test_a_name_that_cannot_even_be_looked_at_costs_no_other_frame(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""A support that bends like a sphere around the camera is told from one that is flat, and from one that bends itself."""
+"""A support that bends like a sphere around the camera is told from a flat one, and from one that bends itself."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ FORMS = {
     "a.intr": json.dumps({"_fx": 60, "_fy": 61, "_cx": 31.5, "_cy": 23.5, "_width": 64, "_height": 48, "_K": 0}),
     "record3d.json": json.dumps({"w": 64, "h": 48, "K": COLUMNS, "fps": 30}),
     "transforms.json": json.dumps({"fl_x": 60, "fl_y": 61, "cx": 31.5, "cy": 23.5, "w": 64.0, "h": 48, "frames": []}),
-    "cameras.txt": "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE 64 48 60.0 61.0 31.5 23.5\n",
+    "cameras.txt": "# Camera list\n#   CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]\n1 PINHOLE 64 48 60 61 31.5 23.5\n",
     "two.txt": "1 PINHOLE 640 480 600 600 320 240\n2 OPENCV 64 48 60.0 61.0 31.5 23.5 0 0 0 0\n",
     "four.txt": "60.0 61.0 31.5 23.5\n",
     "four.csv": "60.0,61.0,31.5,23.5",
@@ -46,7 +46,8 @@ FORMS = {
     "  Fy:\t61\n  Distortion:\tBrown Conrady\n  Coeffs:\t0 \t0 \t0 \t0 \t0\n",
     "both.json": json.dumps({"color": {"fx": 9, "fy": 9, "cx": 3, "cy": 2}, "depth": {"intrinsics": ROWS}}),
     "nested.json": json.dumps({"device": "x", "camera": {"intrinsic_matrix": K.tolist(), "image_size": [64, 48]}}),
-    "fx_depth.yaml": "fx_depth: 60\nfy_depth: 61\ncx_depth: 31.5\ncy_depth: 23.5\nfx_rgb: 9\nfy_rgb: 9\ncx_rgb: 1\ncy_rgb: 1\n",
+    "fx_depth.yaml": "fx_depth: 60\nfy_depth: 61\ncx_depth: 31.5\ncy_depth: 23.5\nfx_rgb: 9\nfy_rgb: 9\ncx_rgb: 1\n"
+    "cy_rgb: 1\n",
 }
 
 
