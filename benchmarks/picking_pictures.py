@@ -31,8 +31,8 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.rendering import render_things
 
-SHOWN = (150, 490), (335, 65)
-"""Columns and rows of a picture."""
+SHOWN = (150.0, 490.0, 65.0, 335.0)
+"""Left, right, top, bottom of a picture, pixels."""
 CAUSES = {
     "collision": "collision with the table or another thing",
     "wrong size": "the fingers do not pass the thing",
@@ -57,7 +57,8 @@ def scenes(path: Path, seed: int, recoverer: Recoverer) -> None:
         seen = picking_contestants.Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world)
         bodies = [one.superquadric for one in seen.recovery.recovered]
         ax = figure.add_axes((0.5 * column + 0.003, 0.0, 0.494, 1.0))
-        _draw(ax, depth, bodies, GraspPlan(picking_contestants.ours(seen)), f"{kind}, {scene.sensor}")
+        plan = seen.plan(bodies, np.array([one.covariance for one in seen.recovery.recovered]))
+        _draw(ax, depth, bodies, plan, f"{kind}, {scene.sensor}")
     plots.save(figure, path, dots_per_inch=90)
 
 
@@ -84,9 +85,7 @@ def failures(path: Path, lines: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def _draw(ax: Any, depth: np.ndarray, bodies: list[Superquadric], plan: GraspPlan, text: str) -> None:
-    plots.draw_grasps(ax, depth, TABLE_CAMERA, bodies, plan, GRIPPER)
-    ax.set_xlim(*SHOWN[0])
-    ax.set_ylim(*SHOWN[1])
+    plots.draw_grasps(ax, depth, TABLE_CAMERA, bodies, plan, GRIPPER, window=SHOWN)
     ax.text(0.02, 0.04, text, transform=ax.transAxes, color=plots.INK, weight="bold")
 
 

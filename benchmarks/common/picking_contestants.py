@@ -40,7 +40,7 @@ from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import planner
-from sq_perception.grasping.plan import Grasp
+from sq_perception.grasping.plan import Grasp, GraspPlan
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.learning import checkpoint
@@ -93,9 +93,12 @@ class Seen:
         """Measured points (n, 3) of one mask."""
         return TABLE_CAMERA.points(self.depth)[(self.recovery.labels == label) & np.isfinite(self.depth)]
 
-    def planned(self, bodies: list[Superquadric], covariance: np.ndarray | None = None) -> tuple[Grasp, ...]:
+    def plan(self, bodies: list[Superquadric], covariance: np.ndarray | None = None) -> GraspPlan:
         around = Surroundings.of_image(self.depth, TABLE_CAMERA, self.recovery.plane)
-        return grasps(Superquadric.stack(bodies), GRIPPER, covariance, around).grasps
+        return grasps(Superquadric.stack(bodies), GRIPPER, covariance, around)
+
+    def planned(self, bodies: list[Superquadric], covariance: np.ndarray | None = None) -> tuple[Grasp, ...]:
+        return self.plan(bodies, covariance).grasps
 
 
 def ours(seen: Seen) -> tuple[Grasp, ...]:

@@ -33,7 +33,7 @@ def main(arguments: Sequence[str]) -> int:
     command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
     for field in fields(TrainingConfig):
         name = "--" + field.name.replace("_", "-")
-        default, text = argparse.SUPPRESS, f"default {field.default!r}"
+        default, text = argparse.SUPPRESS, f"{field.metadata['help']} (default {field.default!r})"
         if isinstance(field.default, bool):
             command.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
         else:

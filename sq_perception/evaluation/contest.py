@@ -114,6 +114,8 @@ def network(path: Path, name: str | None = None) -> Contestant:
         parts.append("started from another network")
     if loss == "occupancy_rotation":
         parts.append("size, shape and place given")
+    if loss == "mse":
+        parts.append("the rotation was not learned")
     return Contestant(
         name or default_name(path),
         ", ".join(parts),

@@ -111,34 +111,38 @@ def draw_grasps(
     plan: GraspPlan,
     hand: Gripper,
     numbers: Sequence[int] | None = None,
+    window: Window | None = None,
 ) -> None:
     """A depth image, the outlines of its bodies and, at the best grasp of each, the gripper with its probability.
 
     A body without a grasp has the reason.  ``numbers`` are those of the bodies, 0, 1, ... if not given.  What of a
-    gripper lies beyond the image is shown beside it, up to a quarter of the image away.
+    gripper lies beyond the image, or its ``window``, is shown too, up to a quarter of it away.
     """
     draw_depth(ax, depth)
     numbers = range(len(bodies)) if numbers is None else numbers
     draw_outlines(ax, bodies, camera, [colour(number) for number in numbers], edges=False, width=1.4)
-    spots = [np.array([[-0.5, -0.5], [camera.width - 0.5, camera.height - 0.5]])]
+    left, right, top, bottom = window or (-0.5, camera.width - 0.5, -0.5, camera.height - 0.5)
+    spots = [np.array([[left, top], [right, bottom]])]
+    border = 0.25 * (spots[0][1] - spots[0][0])
+    room = 0.15 * border  # for a score at the end of a gripper
     for k, number in enumerate(numbers):
-        where, words = camera.project(bodies[k].translation), f"{number}: {shorten(plan.reasons[k], 44)}"
+        reason = shorten(plan.reasons[k], 44) if k < len(plan.reasons) else ""
+        where, words = camera.project(bodies[k].translation), f"{number}: {reason or 'no grasp'}"
         for grasp in plan.of(k)[:1]:
             for line in hand.wires(grasp.opening):
                 pixels = camera.project(grasp.placed(line))
                 ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
                 ax.plot(*pixels.T, color=colour(number), lw=2.6, solid_capstyle="round")
-                spots.append(pixels)
+                spots += [pixels - room, pixels + room]
             where, words = pixels[-1], f"{number}: {grasp.score:.2f}"
         # Beyond the left half of the picture words go to the right, else to the left: they stay within it.
-        side = "left" if where[0] < camera.width / 2 else "right"
+        side = "left" if where[0] < (left + right) / 2 else "right"
         text = ax.text(*where, f" {words} ", color=INK, fontsize=10, weight="bold", ha=side, va="center", clip_on=True)
         text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])  # the picture may be as dark as INK
-    border = 0.25 * np.array([camera.width, camera.height])
     shown = np.vstack(spots)
     shown = shown[np.isfinite(shown).all(axis=1)]
-    low = np.maximum(shown.min(axis=0) - 0.5, -border)
-    high = np.minimum(shown.max(axis=0) + 0.5, spots[0][1] + border)
+    low = np.maximum(shown.min(axis=0), spots[0][0] - border)
+    high = np.minimum(shown.max(axis=0), spots[0][1] + border)
     ax.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), facecolor="white", anchor="C")
 
 

@@ -8,7 +8,7 @@ Backbone = Literal["compact", "resnet18"]
 """The residual networks of :mod:`sq_perception.learning.backbone`."""
 Framing = Literal["cropped", "full"]
 """What a view shows: one object that fills it, or the thesis' whole image."""
-Loss = Literal["occupancy", "occupancy_rotation", "dual", "least_squares", "least_squares_free", "render"]
+Loss = Literal["occupancy", "occupancy_rotation", "dual", "mse", "least_squares", "least_squares_free", "render"]
 """The losses of :mod:`sq_perception.learning.losses`."""
 LOSSES: tuple[str, ...] = get_args(Loss)
 UNSUPERVISED = ("least_squares", "least_squares_free", "render")

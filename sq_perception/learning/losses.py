@@ -55,6 +55,7 @@ What a training minimises
 | occupancy | L_OC at random points | labels | 6 to 25 |
 | occupancy_rotation | L_OC(q): size, shape and place given | labels | 6 to 25 |
 | dual | L_DUAL | labels | 6 to 25 |
+| mse | L_MSE: the rotation given | labels | |
 | least_squares | L_LS | the view | |
 | least_squares_free | L_LS and free space | the view | |
 | render | L_DR | the view | 6 to 100 |
@@ -186,6 +187,8 @@ class Objective:
     sharpness_start: float = 0.0
     sharpness_end: float = 0.0
     """s at the start and the end of the run; 0 takes the values of the table."""
+    tau: float = 0.0
+    """n tau / s of the render loss; 0 takes its own value."""
     framing: str = "cropped"
     """Framing of the views."""
     stride: int = 2
@@ -217,6 +220,8 @@ class Objective:
         s = self.sharpness(progress)
         if self.needs_labels:
             assert truth is not None
+            if self.name == "mse":
+                return parameter_loss(prediction, truth)
             around = [points_around(truth, self.points // 2, generator, scale) for scale in (1.15, 2.0)]
             compare = {
                 "occupancy": occupancy_loss,
@@ -227,7 +232,7 @@ class Objective:
         row, column = torch.randint(self.stride, (2,), generator=generator, device=views.device).tolist()
         lines, depth = sight_lines.of_view(views[:, 0], self.stride, row, column, self.framing)
         if self.name == "render":
-            return render_loss(prediction, lines, depth, s, _DENSITY * s)
+            return render_loss(prediction, lines, depth, s, (self.tau or _DENSITY) * s)
         smallness = max(0.0, 1 - progress / _CURRICULUM)
         loss = least_squares_loss(prediction, lines, depth)
         loss = loss * (prediction.size.prod(dim=-1) / _TYPICAL_VOLUME) ** smallness
@@ -240,4 +245,6 @@ class Objective:
 
     def with_given(self, prediction: Superquadric, truth: Superquadric) -> Superquadric:
         """The bodies that a validation compares with the true ones: what is given counts as predicted."""
+        if self.name == "mse":
+            return Superquadric(prediction.size, prediction.shape, prediction.translation, truth.rotation)
         return turned_truth(prediction, truth) if self.name == "occupancy_rotation" else prediction

@@ -104,7 +104,7 @@ def train(
         before = _check_same_run(config, output)
         _check_batch(config.batch, model.config)
         objective = Objective(
-            config.loss, config.points, config.sharpness_start, config.sharpness_end, framing=config.framing
+            config.loss, config.points, config.sharpness_start, config.sharpness_end, config.tau, config.framing
         )
         layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
         model.to(memory_format=layout)  # type: ignore[call-overload]

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -40,6 +40,11 @@ _SEEDS = 2**63
 _PATIENCE = 10
 _LONGEST = 20
 _FACTOR = 0.1
+
+
+def _setting(default: Any, meaning: str) -> Any:
+    """A field of a run, whose meaning the command's help shows."""
+    return field(default=default, metadata={"help": meaning})
 
 
 def cosine(step: int, warm_up: int, steps: int) -> float:
@@ -85,60 +90,59 @@ class TrainingConfig:
         For an unknown name, a number out of its range, or settings that contradict each other.
     """
 
-    loss: str = "occupancy"
-    """What is minimised, by its name in :mod:`sq_perception.learning.losses`."""
-    backbone: str = "compact"
-    """compact, or resnet18 as in the thesis."""
-    framing: str = "cropped"
-    """What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."""
-    pixels: int = 64
-    """Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."""
-    start: str = ""
-    """A model file whose weights the network begins with; empty begins at random."""
-    data: str = ""
-    """Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."""
-    canonical_labels: bool = False
-    """List the axes of every label so that a1 >= a2; as drawn, their order is random."""
-    pinhole_share: float = 0.0
-    """Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."""
-    wide_share: float = 0.0
-    """Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."""
-    occluded_share: float = 0.0
-    """Share of the views with an occluder before the body."""
-    noisy_share: float = 0.0
-    """Share of the views with noise, steps, holes and wrong edges."""
-    reuse: int = 4
-    """How often a rendered view is used."""
-    steps: int = 20000
-    """Steps of the run; with the plateau schedule, the most it may take."""
-    batch: int = 128
-    """Views a step."""
-    points: int = 256
-    """Comparison points a body: half close around it, half in twice its box."""
-    sharpness_start: float = 0.0
-    """s at the start of the run: far basins first, fine fit last; 0 takes the loss's own value."""
-    sharpness_end: float = 0.0
-    """s at its end."""
-    optimizer: str = "adamw"
-    """adamw, or adam as in the thesis."""
-    schedule: str = "cosine"
-    """cosine: warm up, then fall to 0; plateau: divide by 10 after 10 validations without progress, stop after 20."""
-    learning_rate: float = 1.5e-3
-    weight_decay: float = 1e-2
-    """For adamw; adam has none."""
-    warm_up: int = 400
-    """Steps over which the learning rate rises under the cosine schedule."""
-    average: float = 0.999
-    """The averaged weights keep this much of themselves at each step; they are what is validated and saved."""
-    bfloat16: bool = True
-    """Compute the network in bfloat16 where it is safe and the device has it (automatic mixed precision)."""
-    validation: int = 1000
-    """Bodies in each validation set, and steps between validations."""
-    seed: int = 1
-    threads: int = 0
-    """CPU threads of the network, and of the rendering of its views; 0 leaves both their own choice."""
-    device: str = "cpu"
-    """cpu or cuda."""
+    loss: str = _setting("occupancy", "What is minimised; the equations are in sq_perception/learning/losses.py.")
+    backbone: str = _setting("compact", "compact, or resnet18 as in the thesis.")
+    framing: str = _setting(
+        "cropped", "What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."
+    )
+    pixels: int = _setting(
+        64, "Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."
+    )
+    start: str = _setting("", "A model file whose weights the network begins with; empty begins at random.")
+    data: str = _setting(
+        "", "Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."
+    )
+    canonical_labels: bool = _setting(
+        False, "List the axes of every label so that a1 >= a2; as drawn, their order is random."
+    )
+    pinhole_share: float = _setting(
+        0.0, "Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."
+    )
+    wide_share: float = _setting(
+        0.0, "Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."
+    )
+    occluded_share: float = _setting(0.0, "Share of the views with an occluder before the body.")
+    noisy_share: float = _setting(0.0, "Share of the views with noise, steps, holes and wrong edges.")
+    reuse: int = _setting(4, "How often a rendered view is used.")
+    steps: int = _setting(20000, "Steps of the run; with the plateau schedule, the most it may take.")
+    batch: int = _setting(128, "Views a step.")
+    points: int = _setting(256, "Comparison points a body: half close around it, half in twice its box.")
+    sharpness_start: float = _setting(
+        0.0, "s of the loss at the start of the run, far basins first; 0 takes the loss's own value."
+    )
+    sharpness_end: float = _setting(0.0, "s of the loss at the end of the run.")
+    tau: float = _setting(0.0, "n tau / s of the render loss, how soon a ray is hit (7.10); 0 takes 2.")
+    optimizer: str = _setting("adamw", "adamw, or adam as in the thesis.")
+    schedule: str = _setting(
+        "cosine",
+        "cosine: warm up, then fall to 0; plateau: divide by 10 after 10 "
+        "validations without progress, stop after 20.",
+    )
+    learning_rate: float = _setting(1.5e-3, "The largest learning rate.")
+    weight_decay: float = _setting(1e-2, "For adamw; adam has none.")
+    warm_up: int = _setting(400, "Steps over which the learning rate rises under the cosine schedule.")
+    average: float = _setting(
+        0.999, "The averaged weights keep this much of themselves at each step; they are what is validated and saved."
+    )
+    bfloat16: bool = _setting(
+        True, "Compute the network in bfloat16 where it is safe and the device has it (automatic mixed precision)."
+    )
+    validation: int = _setting(1000, "Bodies in each validation set, and steps between validations.")
+    seed: int = _setting(1, "Seed of the weights, the views and their order.")
+    threads: int = _setting(
+        0, "CPU threads of the network, and of the rendering of its views; 0 leaves both their own choice."
+    )
+    device: str = _setting("cpu", "cpu or cuda.")
 
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():
@@ -147,7 +151,7 @@ class TrainingConfig:
         for name, least in (("steps", 1), ("batch", 1), ("points", 2), ("validation", 1), ("reuse", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
-        for name in ("seed", "threads", "sharpness_start", "sharpness_end"):
+        for name in ("seed", "threads", "sharpness_start", "sharpness_end", "tau"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
         for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
@@ -244,7 +248,7 @@ def _values(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected 'name: value' lines")
-    known = {field.name: type(field.default) for field in fields(TrainingConfig)}
+    known = {each.name: type(each.default) for each in fields(TrainingConfig)}
     for name, value in values.items():
         if name not in known:
             raise ValueError(f"{path}: there is no setting {name!r}")

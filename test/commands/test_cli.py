@@ -254,7 +254,10 @@ def test_demo_without_ros_says_what_is_missing():
 
 @pytest.mark.parametrize(
     ("command", "words"),
-    [("train", ("--steps", "least_squares_free")), ("evaluate", ("--fit-bodies", "report.md"))],
+    [
+        ("train", ("--steps", "least_squares_free", "mse", "--tau", "What is minimised", "Views a step")),
+        ("evaluate", ("--fit-bodies", "report.md")),
+    ],
 )
 def test_commands_have_a_help_of_their_own(command, words, capsys):
     assert main.main([command, "--help"]) == main.SUCCESS

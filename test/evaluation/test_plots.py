@@ -78,6 +78,30 @@ def test_scores_of_grasps_can_be_read_where_the_picture_is_dark():
     assert np.ptp(letters.mean(axis=2)) > 150
 
 
+def test_grippers_beyond_the_image_are_shown_whole_and_a_body_without_grasp_says_why():
+    """A hand above the upper border, whose end and score were cut off; and words at the right border."""
+    aside = Superquadric(BODY.size, BODY.shape, BODY.translation + np.array([0.25, 0.0, 0.0]), BODY.rotation)
+    down = np.array([np.sin(-np.pi / 4), 0, 0, np.cos(np.pi / 4)])  # approaches along the image's y axis
+    grasp = Grasp(0, BODY.translation - np.array([0, 0.28, 0]), down, 0.08, 0.06, 0.875, "")
+    figure = plots.new_figure(6.4, 4.8)
+    ax = figure.add_axes((0, 0, 1, 1))
+    depth = np.full((CAMERA.height, CAMERA.width), 0.8)
+    plan = GraspPlan((grasp,), ("", "too wide for the gripper"))
+    plots.draw_grasps(ax, depth, CAMERA, [BODY, aside], plan, PANDA, numbers=[0, 3])
+    drawn(figure)
+    score, reason = ax.texts
+    assert (score.get_text().strip(), reason.get_text().strip()) == ("0: 0.88", "3: too wide for the gripper")
+    frame = ax.get_window_extent()
+    for words in (score, reason):
+        box = words.get_window_extent()
+        assert frame.x0 <= box.x0 < box.x1 <= frame.x1
+        assert frame.y0 <= box.y0 < box.y1 <= frame.y1
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    wires = CAMERA.project(np.concatenate([grasp.placed(line) for line in PANDA.wires(grasp.opening)]))
+    assert wires[:, 1].min() < 0, "beyond the image"
+    assert ((wires >= [left, top]) & (wires <= [right, bottom])).all()
+
+
 def test_a_view_from_the_camera_s_side_looks_like_the_image():
     """A ball left of a box stays on the left from the front; from the right the box hides it."""
     left = Superquadric([0.05] * 3, [1.0, 1.0], [-0.2, 0, 1.0], [0, 0, 0, 1.0])

@@ -44,6 +44,16 @@ class TestParameterLoss:
         assert losses.parameter_loss(guess, truth).item() == pytest.approx((0.1**2 + 0.2**2) / 8)
 
 
+    def test_a_training_minimises_it_and_validates_with_the_true_rotation(self) -> None:
+        truth, guess = (tensors(thesis_bodies(4, np.random.default_rng(seed))) for seed in (3, 4))
+        objective = Objective("mse")
+        found = objective.loss(guess, torch.zeros(4, 1, 16, 16), truth, 0.5, torch.Generator())
+        torch.testing.assert_close(found, losses.parameter_loss(guess, truth))
+        shown = objective.with_given(guess, truth)
+        assert (shown.rotation == truth.rotation).all()
+        assert (shown.size == guess.size).all()
+
+
 class TestOccupancyLoss:
     def test_hand_computed(self) -> None:
         """One point: at the centre of the truth (G = sigma(s)) and on the prediction's surface (G = 1/2)."""
@@ -132,6 +142,20 @@ class TestLeastSquares:
             assert losses.least_squares_loss(box, lines, depth).item() < 2e-4
         assert losses.free_space_loss(narrow, lines, depth).item() < 1e-6
         assert losses.free_space_loss(wide, lines, depth).item() > 0.01
+
+
+class TestTau:
+    def test_a_training_takes_its_own_unless_another_is_given(self) -> None:
+        """7.10: D = n tau, in units of s."""
+        guess = tensors(thesis_bodies(2, np.random.default_rng(5)))
+        view = torch.zeros(2, 1, 16, 16, dtype=DOUBLE)
+
+        def loss(**given: float) -> torch.Tensor:
+            objective = Objective("render", sharpness_start=20.0, sharpness_end=20.0, **given)
+            return objective.loss(guess, view, None, 0.0, torch.Generator().manual_seed(1))
+
+        torch.testing.assert_close(loss(), loss(tau=2.0))
+        assert not torch.allclose(loss(), loss(tau=0.5))
 
 
 class TestRenderLoss:

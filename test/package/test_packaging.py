@@ -17,8 +17,6 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-import sq_perception
-
 NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 PACKAGE = "sq_perception"
 
@@ -207,6 +205,13 @@ def test_the_messages_install_alone_with_numpy_only(source_copy: Path, tmp_path:
     said = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (said.returncode, said.stderr) == (0, "")
     assert str(tmp_path) in said.stdout
+
+
+def test_both_opencv_releases_that_pip_resolves_are_tested(repository: Path) -> None:
+    (path,) = (repository / ".github" / "workflows").glob("*.yml")
+    jobs = yaml.safe_load(path.read_text(encoding="utf-8"))["jobs"]
+    assert jobs["test"]["strategy"]["matrix"]["opencv"] == ["4", "5"]
+    assert any("opencv-python-headless==${{ matrix.opencv }}.*" in step.get("run", "") for step in jobs["test"]["steps"])
 
 
 def test_the_source_archive_is_whole(source_copy: Path, tmp_path: Path) -> None:
