@@ -51,46 +51,12 @@ _MATCH = 0.5
 FIGURES = ("found", "nothing", "pieces", "iou")
 
 
-def _no_pixels(relative_or_seen: Any, pixels: np.ndarray, *_: Any) -> np.ndarray:
-    return np.zeros(pixels.shape, bool)
-
-
-def _as_first_asked(labels: np.ndarray, least: int, most: int, accept: Any = None) -> Any:
-    """`segments._ordered` that asks no segment twice."""
-    from sq_perception.imaging import regions
-
-    extents = regions.extents(labels)
-    order = np.argsort(-extents[:, 0], kind="stable")
-    asked = [label for label in order.tolist() if extents[label, 0] >= least]
-    kept = [k for k in asked if accept is None or accept(*regions.pixels(labels, k, extents[k]))]
-    is_cut, kept = len(kept) > most, kept[:most]
-    number = np.zeros(len(extents), np.int32)
-    number[kept] = np.arange(len(kept)) + 1
-    return regions.renumbered(labels, number), tuple(range(1, len(kept) + 1)), is_cut
-
-
 _S = "sq_perception.segmentation"
 _OWN = "sq_perception.recovery.own_segments"
 RULES: dict[str, dict[str, Any]] = {
-    "the least height of a thing": {f"{_S}.standing.MIN_HEIGHT": 0.0, f"{_S}.standing._LEAST_HEIGHT": 0.0},
-    "above the noise (_rises)": {f"{_S}.standing._rises": lambda *_: True},
-    "a part of a wall (_is_part)": {f"{_S}.standing._is_part": lambda *_: False},
-    "an upright face (_is_wall)": {f"{_S}.standing._is_wall": lambda *_: False},
-    "seen support under it (_stands)": {f"{_S}.standing._stands": lambda *_: True},
-    "all four of these": {
-        f"{_S}.standing._rises": lambda *_: True,
-        f"{_S}.standing._is_part": lambda *_: False,
-        f"{_S}.standing._is_wall": lambda *_: False,
-        f"{_S}.standing._stands": lambda *_: True,
-    },
-    "planes larger than a thing (furniture)": {f"{_S}.standing.furniture": lambda seen, valid: _no_pixels(0, valid)},
-    "asked twice (_ordered)": {f"{_S}.segments._ordered": _as_first_asked},
-    "walls around things (enclosures)": {f"{_S}.enclosures.walls": lambda *_: set()},
-    "level tops (level_faces)": {f"{_S}.level_faces.found": lambda *_: []},
     "ramps (risen)": {f"{_S}.support_surface.risen": lambda relative, *_: np.zeros(relative.shape, bool)},
     "a bent support": {f"{_S}.support_surface._GAIN": np.inf},
     "grazing sides (_jagged_share)": {f"{_S}.bodies._JAGGED": -1.0},
-    "parts joined are no larger than a thing": {f"{_S}.convex_parts.corrected": "without holds"},
     "vessels: insides and walls": {f"{_S}.convex_parts._insides": lambda *_: []},
     "vessels: pieces (_with_whole_vessels)": {f"{_S}.convex_pieces._with_whole_vessels": lambda group, *_: group},
     "behind something nearer (_go_on)": {f"{_S}.convex_parts._go_on": lambda i, n, t, wanted: np.zeros_like(wanted)},
@@ -102,7 +68,10 @@ RULES: dict[str, dict[str, Any]] = {
     "table above a floor (_STOREY)": {f"{_S}.support_plane._STOREY": np.inf},
     "near above the plane (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
     "small table before a wall (_LEAST_BEFORE_WALL)": {f"{_S}.support_plane._LEAST_BEFORE_WALL": 0.1},
-    "network: of an object": {f"{_OWN}._OF_AN_OBJECT": 0.0},
+    "a probability that it is a thing (LEAST)": {f"{_S}.objectness.LEAST": 0.0},
+    "that probability by the network alone": {f"{_S}.objectness._MOST_SURE": 0.1},
+    "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
+    "pieces of what is too large (claims)": {f"{_OWN}._claimed": lambda *_: ()},
     "network: parts": {f"{_OWN}.SegmentNetwork._parted": lambda *_: []},
     "network: parts behind something": {f"{_OWN}.SegmentNetwork._one_behind": lambda self, labels, parts, s: parts},
     "network: joins": {f"{_OWN}._ONE": 1.0},
@@ -117,11 +86,6 @@ def without(rule: str | None) -> Iterator[None]:
     """The segmentation without a rule."""
     with ExitStack() as stack:
         for name, value in RULES[rule].items() if rule else ():
-            if isinstance(value, str):
-                from sq_perception.segmentation import convex_parts
-
-                original = convex_parts.corrected
-                value = lambda labels, depth, camera, sigma, holds=None, f=original: f(labels, depth, camera, sigma)  # noqa: E731
             stack.enter_context(mock.patch(name, value))
         yield
 
@@ -142,12 +106,13 @@ masks = cache(inference.load_masks)
 
 def segmented(depth: np.ndarray, camera: Camera, rule: str, known: dict[bytes, np.ndarray]) -> np.ndarray:
     """Own masks (height, width), as a recoverer has them; the network's answers to the same segments are ``known``."""
-    found = segments.segment(depth, camera, SegmentationOptions(max_objects=MOST))
+    found = segments.proposed(depth, camera)
     plane = b"" if found.plane is None else found.plane.tobytes()
     key = (rule if rule.startswith("network") else "").encode() + plane + found.labels.tobytes()
     if key not in known:
         network = SegmentNetwork(masks(), depth, camera, found.plane, lambda function, items: function(items))
-        known[key] = network.improved(found).labels
+        found = network.improved(found)
+        known[key] = segments.limited(found, depth, camera, SegmentationOptions(max_objects=MOST)).labels
     return known[key]
 
 

@@ -5,10 +5,10 @@
 | table, low, steep | household things on a table, seen 20 to 70, 3 to 20, 70 to 90 degrees above it |
 | flat | two to five cartons or books of 16 to 24 x 12 to 17 cm, each 13 to 35 mm thick, on a table |
 | room | a table that ends, and what stands on the floor behind it |
-| floor | small things on the floor of a room, beside pieces that are larger than a thing, seen by a robot's own camera |
+| floor | small things on the floor of a room, beside what is larger than a thing, seen by a robot's camera |
 | heap | 20 to 60 bodies of 4 to 7 cm that touch |
 | crowd | up to twelve superquadrics that touch |
-| carton, stool, shelf board, shelves, tray, bin | things in and on furniture (:mod:`sq_perception.simulation.furniture`) |
+| carton, stool, shelf board, shelves, tray, bin | things in and on :mod:`sq_perception.simulation.furniture` |
 | nothing | a table and the room behind it, and no thing |
 
 A quarter of the images is measured by a sensor of random parameters, the others by one of

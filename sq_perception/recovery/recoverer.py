@@ -62,8 +62,6 @@ _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
 _SPARSE = 8
 """Every so many-th pixel tells what unit an image has."""
-_SEGMENTS = 2
-"""For each object that is asked for: a network joins some, and drops what shows none, which may be the largest."""
 
 
 class Recoverer:
@@ -242,8 +240,9 @@ class Recoverer:
         with timed(milliseconds, "score"):
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
             of_label = dict(same)
+            likely = dict(zip(found.ids, found.objectness, strict=False))
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
-                of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
+                of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0))
             bodies = tuple(of_label[obj.label] for obj in objects)
         readings, stride = continuity.sampled(measured, camera)
         reference = Reference(readings, stride, camera, options, found, age=age, given=labels is not None)
@@ -251,8 +250,13 @@ class Recoverer:
             kept_labels = [body.label for body in bodies if body.repeats]
             reference = continuity.mixed(reference, previous.reference, found.labels, kept_labels)
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-        message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
-        message = "; ".join(filter(None, (message, _wrong_unit(measured, camera))))
+        said = (
+            "" if bodies else _why_empty(depth, found, labels),
+            _without_support(found, camera, labels) if bodies else "",
+            _left_out(found, options),
+            _wrong_unit(measured, camera),
+        )
+        message = "; ".join(filter(None, said))
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _segmented(
@@ -267,14 +271,12 @@ class Recoverer:
         ``network`` predicts hulls."""
         if labels is not None:
             return segments.from_labels(labels, depth, camera, options)
-        if not (options.repair and isinstance(network, inference.ThingPredictor)):
-            return segments.segment(depth, camera, options)
-        found = segments.segment(depth, camera, replace(options, max_objects=_SEGMENTS * options.max_objects))
-        found = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
-        if len(found.ids) <= options.max_objects:
-            return found
-        most = found.ids[: options.max_objects]
-        return replace(found, labels=np.where(np.isin(found.labels, most), found.labels, 0), ids=most, is_cut=True)
+        found = segments.proposed(depth, camera, options.depth_range)
+        if options.repair and isinstance(network, inference.ThingPredictor):
+            found = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
+        else:
+            found = segments.judged(found)
+        return segments.limited(found, depth, camera, options)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; with ``auto``, bodies are predicted only once a fit asks for one."""
@@ -365,9 +367,16 @@ def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, f
 
 
 def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
-    if not found.is_cut:
-        return ""
-    return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
+    """What was seen and is not among the objects, in words."""
+    said = []
+    if found.larger:
+        objects = "1 object is" if found.larger == 1 else f"{found.larger} objects are"
+        said.append(f"{objects} larger than max_size = {options.max_size:g} m and left out")
+    if found.outside:
+        said.append(f"{found.outside} outside of the workspace left out")
+    if found.is_cut:
+        said.append(f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out")
+    return "; ".join(said)
 
 
 def _wrong_unit(depth: np.ndarray, camera: Camera) -> str:
@@ -385,6 +394,13 @@ def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarr
         return "the image holds no depth"
     if labels is not None and labels.max() <= 0:
         return "the masks hold no object"
+    if found.larger or found.outside:
+        return "no object of the wanted size and place"
     if found.plane is not None:
         return "nothing stands on the plane"
-    return "no object of the wanted size and distance"
+    return "no support plane and no object found"
+
+
+def _without_support(found: segments.Segmentation, camera: Camera, labels: np.ndarray | None) -> str:
+    is_own = labels is None and camera.is_pinhole and found.plane is None
+    return "no support plane found" if is_own else ""
