@@ -1,4 +1,4 @@
-# make demo    watch superquadrics being recovered from a synthetic camera; FRAME=file for a recorded frame
+# make demo    real nodes recover superquadrics from a simulated camera; writes demo.png and demo.glb
 # make quick   the tests of the core: no processes, no ROS, no browser; about a minute
 # make test    lint and the whole test suite, against the installed package
 # make lint    ruff and mypy alone
@@ -12,7 +12,6 @@
 # PIP_FLAGS='...'       options for pip, for instance --extra-index-url with PyTorch's index of CPU builds
 
 PYTHON ?= python3
-FRAME ?=
 PIP_FLAGS ?=
 SECONDS_SHOWN ?= 20
 
@@ -63,8 +62,7 @@ $(VENV)/.package: $(VENV)/.dependencies $(SOURCES)
 	touch $@
 
 demo: $(VENV)/.package
-	$(VENV)/bin/sq-perception demo --seconds $(SECONDS_SHOWN) $(if $(FRAME),--frame "$(FRAME)") \
-		$(if $(CAMERA_INFO),--camera-info "$(CAMERA_INFO)")
+	$(VENV)/bin/sq-perception demo --seconds $(SECONDS_SHOWN)
 
 # Of the sources, so that it need not wait for the package.
 lint: $(VENV)/.dependencies

@@ -21,7 +21,6 @@ SUBPACKAGES = (
     "tracking",
     "recovery",
     "recordings",
-    "viewing",
     "evaluation",
     "nodes",
     "commands",
@@ -41,9 +40,6 @@ if "bdist_wheel" in sys.argv:
 bags = [
     "rosbags>=0.11.9,<0.12",  # rosbag2 without ROS; its tables of decompressors are no promise beyond
     "mcap>=1.2,<2",  # writes MCAP files, by the authors of the format
-]
-view = [
-    "viser>=1.1.1,<1.2",  # the page of `sq-perception view`, all of it local; its server is guarded by a way of calling
 ]
 exr = [
     "OpenEXR>=3.3,<4",  # depth images of renderers; OpenCV's wheels are built without; 2 MB
@@ -113,7 +109,6 @@ setup(
         "cluster": cluster,
         "exr": exr,
         "train": train,
-        "view": view,
         "picking": picking,
         "docs": docs,
         "test": [
@@ -122,7 +117,6 @@ setup(
             *cluster,
             *exr,
             *train,
-            *view,
             *picking,
             *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation

@@ -17,6 +17,7 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
+from children import Children
 from common import (
     own_domain,  # noqa: F401
     report,
@@ -27,7 +28,6 @@ from running_nodes import Peer, arguments, environment, until, usage
 from sensor_msgs.msg import Image
 
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.commands.children import Children
 
 EVERY = 100
 _UNDISTURBED = 30

@@ -4,7 +4,11 @@
 
 The network alone: NumPy views to NumPy bodies, checks and decoding included.  compact is the shipped network on 64 x 64
 views of thesis bodies; resnet18 is the thesis' network on 256 x 256 with random weights, whose speed is that of trained
-ones.  "forward" is what the package itself takes for compact networks.  The whole recovery: a 256 x 256 image of one
+ones.  "forward" is what the package itself takes for compact networks.  onnxruntime is compared where it is installed:
+
+    pip install 'onnxruntime<1.29' onnx onnxscript
+
+The whole recovery: a 256 x 256 image of one
 thesis body to its result, segmentation to score, with the shipped network.  With a graphics card both are done there
 too.
 
@@ -19,6 +23,8 @@ from __future__ import annotations
 if __name__ == "__main__":
     from common import one_thread  # noqa: F401
 
+import importlib.util
+import io
 import itertools
 import time
 from collections.abc import Callable
@@ -32,6 +38,7 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewSource, draw_views
 from sq_perception.learning.forward import CompactRegressor
+from sq_perception.learning.network_config import checked_views
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.simulation.scenes import thesis_bodies
@@ -51,9 +58,34 @@ def engines(model: Regressor) -> dict[str, Callable[[np.ndarray], Any]]:
         weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
         ways["forward"] = CompactRegressor(model.config, weights).predict
     ways[RIVAL] = model.for_inference().predict
+    if importlib.util.find_spec("onnxruntime") is not None:
+        ways["onnxruntime"] = predict_by_onnxruntime(model)
     if torch.cuda.is_available():
         ways["GPU, folded"] = model.for_inference().to("cuda").predict
     return ways
+
+
+def predict_by_onnxruntime(model: Regressor) -> Callable[[np.ndarray], Any]:
+    """The network as a graph that onnxruntime computes on one thread, its telemetry off."""
+    import onnxruntime
+
+    onnxruntime.disable_telemetry_events()
+    graph = io.BytesIO()
+    views = torch.zeros(2, 1, model.config.pixels, model.config.pixels)
+    copied = model.for_inference()
+    copied.forward = copied.raw  # type: ignore[method-assign]
+    program = torch.onnx.export(copied, (views,), dynamic_shapes=({0: torch.export.Dim("views")},), verbose=False)
+    program.save(graph)
+    settings = onnxruntime.SessionOptions()
+    settings.intra_op_num_threads = settings.inter_op_num_threads = 1
+    session = onnxruntime.InferenceSession(graph.getvalue(), settings, providers=["CPUExecutionProvider"])
+    name = session.get_inputs()[0].name
+
+    def predict(views: np.ndarray) -> Any:
+        (raw,) = session.run(None, {name: checked_views(views, model.config)[:, None]})
+        return model.config.decode(raw.astype(float))
+
+    return predict
 
 
 def of_network(model: Regressor, rounds: int) -> dict[str, Any]:

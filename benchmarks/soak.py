@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from children import Children
 from common import (
     own_domain,  # noqa: F401
     report,
@@ -36,8 +37,6 @@ from running_nodes import (
     usage,
 )
 from std_srvs.srv import SetBool
-
-from sq_perception.commands.children import Children
 
 CAMERA_NODE = "synthetic_depth_node"
 SCENES = 8

@@ -3,7 +3,7 @@
     python benchmarks/still_scenes.py [--scenes 4] [--frames 16] [--sensor stereo] [--name still_scenes]
 
 Scenes of 1, 5 and 8 things as in :mod:`household_things`, VGA, own masks; each frame has new noise.  After the first
-one, each is recovered alone and with the one before it (``previous``), in turn, in one thread of one process, so that
+one, each is recovered alone and by a StillScene, in turn, in one thread of one process, so that
 what slows the machine slows both.
 
     alone, following  milliseconds of processor time a frame, medians, and the mean of the latter, which has the frames
@@ -26,6 +26,7 @@ import numpy as np
 from common import report, scene_verdict, tabletop
 
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
+from sq_perception.recovery.still_scene import StillScene
 from sq_perception.simulation import sensor_noise
 
 COUNTS = (1, 5, 8)
@@ -45,22 +46,21 @@ def measured(recoverer: Recoverer, count: int, scenes: int, frames: int, sensor:
     repeated: list[bool] = []
     for seed in range(scenes):
         scene = household_things.scene(seed, sensor, count)
-        noise, previous = sensor_noise.preset(tabletop.SENSORS[sensor]), None
+        noise, still = sensor_noise.preset(tabletop.SENSORS[sensor]), StillScene(recoverer)
         for number in range(frames):
             rng = np.random.default_rng([household_things.SEED, seed, count, number])
             depth = noise.measured(scene.true_depth, scene.camera, rng)
             moments = [time.process_time()]
             alone = recoverer.recover(depth, scene.camera)
             moments.append(time.process_time())
-            following = recoverer.recover(depth, scene.camera, previous=previous)
+            following = still.recover(depth, scene.camera)
             moments.append(time.process_time())
-            if previous is not None:
+            if number:
                 spent = 1e3 * np.diff(moments)
                 times.append((float(spent[0]), float(spent[1])))
                 quality["alone"] += ious(alone, scene, depth)
                 quality["following"] += ious(following, scene, depth)
                 repeated += [body.repeats > 0 for body in following.bodies]
-            previous = following
     alone_ms, following_ms = np.array(times).T
     return {
         "alone": report.spread(alone_ms),

@@ -120,6 +120,18 @@ def prediction() -> str:
     )
 
 
+def camera_spread() -> str:
+    """Figures of recorded images beside those of simulated cameras."""
+    sources = {"mosd": "Kinect v1, 45 frames", "felix": "RealSense, 4", "pcl": "Kinect and stereo, 4"}
+    rows = []
+    for name, found in results("camera_spread").items():
+        if isinstance(found, dict) and "within" in found:
+            spread = " / ".join(f"{value:.2f}" for value in found["simulated"])
+            medians = " | ".join(f"{found[source]:.2f}" for source in sources)
+            rows.append(f"{name} | {spread} | {medians} | {100 * found['within']:.0f}")
+    return table(f"figure | simulated, 5 / 50 / 95 % | {' | '.join(sources.values())} | frames within, %", rows)
+
+
 def frame_time() -> str:
     """Whole frames of a simulated RealSense, VGA, own masks."""
     found = results("frame_time")["rows"]
@@ -349,6 +361,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         household,
         kinds,
         prediction,
+        camera_spread,
         known,
         ablation,
         recorded,

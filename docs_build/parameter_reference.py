@@ -41,7 +41,8 @@ if it cannot be made the old one stays, and `/diagnostics` says why. Another `me
 Quality of service is a parameter too, at the start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`,
 `.history`, or `.publisher.` and also `.durability`, with the topic as it is after remapping. recover_node takes it for
 its inputs and for `~/superquadrics`, `~/markers`, `~/rendered_depth` and `~/support_plane`, synthetic_depth_node for
-all its topics, grasp_node for none.
+all its topics, grasp_node for `superquadrics`. The reliability of an input is `best_available` by default: reliable once
+all publishers of the topic are, best effort while one is not.
 """
 
 
@@ -64,8 +65,9 @@ def yaml_text(name: str) -> str:
     ]
     if issubclass(kind, RecoverParameters):
         lines += [
-            "# Inputs are best effort, keep last 1; qos_overrides./depth/image.subscription.reliability: reliable, for",
-            "# instance, changes that (also .history and .depth; the topic's name is the one after remapping).",
+            "# Inputs keep the last message and are as reliable as all publishers of their topic are;",
+            "# qos_overrides./depth/image.subscription.reliability: best_effort, for instance, changes that (also .history",
+            "# and .depth; the topic's name is the one after remapping).",
         ]
     lines += ["/**:", "  ros__parameters:"]
     for one in fields(kind):

@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from geometry_msgs.msg import Pose, Quaternion
 
-from sq_msgs_py.poses import pose_messages, unit_quaternions
-from sq_msgs_py.shapes import enclosing_factor, mesh_message, primitive
+from sq_msgs_py.poses import matrices, pose_messages, unit_quaternions
+from sq_msgs_py.shapes import enclosing_factor, mesh_message, primitive, support
 from sq_msgs_py.superquadrics import SuperquadricArray
 from sq_msgs_py.transforms import PREFIX, name
 
@@ -35,6 +35,12 @@ Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (k, 3) and faces (m, 3)."""
 _STEP = 0.002
 """Metres: a body of which no point has moved farther is not sent again to planners, whose paddings are larger."""
+_HEIGHTS = (np.arange(128) + 0.5) / 128
+_TURNS = np.pi * (1 + np.sqrt(5)) * np.arange(128)
+_DIRECTIONS = np.stack(
+    [np.sqrt(1 - _HEIGHTS**2) * np.cos(_TURNS), np.sqrt(1 - _HEIGHTS**2) * np.sin(_TURNS), _HEIGHTS], axis=1
+)
+"""Of one half of the sphere, as bodies are symmetric, 13 degrees apart."""
 _AGAIN, _MOST_GONE = 2, 100
 """Repetitions that remove a body that is gone, as a planner may be busy when the first one comes, and of how many."""
 
@@ -138,19 +144,21 @@ class Scene:
 
 
 def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
-    """Whether a point of a body may have moved by more than a step since planners were sent it."""
+    """Whether the space that a body takes has changed by more than a step since planners were sent it.
+
+    By how far both reach in every direction, the Hausdorff distance of convex bodies: numbers are no measure, as those
+    of a round body at rest turn about its axis from frame to frame.
+    """
     if known is None:
         return True
-    largest, reach = float(known.size.max()), float(np.linalg.norm(known.size[0]))
-    turn = 2 * np.arccos(
-        min(1.0, abs(float(np.vdot(unit_quaternions(known.rotation[0]), unit_quaternions(shown.rotation[k])))))
-    )
-    moves = (
-        np.linalg.norm(part[0] - new[k])
-        for part, new in ((known.translation, shown.translation), (known.size, shown.size))
-    )
-    rounds = largest * np.abs(known.shape[0] - shown.shape[k]).max()
-    return bool(sum(moves) + rounds + reach * turn > _STEP)
+    before, now = _reach(known, 0), _reach(shown, k)
+    shift = np.abs(_DIRECTIONS @ (shown.translation[k] - known.translation[0]))
+    return bool((shift + np.abs(now - before)).max() > _STEP)
+
+
+def _reach(bodies: SuperquadricArray, k: int) -> np.ndarray:
+    turn = matrices(unit_quaternions(bodies.rotation[k]))
+    return support(_DIRECTIONS @ turn, bodies.size[k], bodies.shape[k], bodies.taper[k])
 
 
 def collision_objects(
@@ -192,7 +200,7 @@ def collision_objects(
             added.primitives, added.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
         else:
             vertices, faces = meshes[k]
-            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k])
+            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k], bodies.taper[k])
             added.meshes, added.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
         objects.append(added)
     return objects

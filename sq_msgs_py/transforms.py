@@ -26,6 +26,11 @@ def name(number: int, prefix: str = PREFIX) -> str:
     return f"{prefix}{int(number)}"
 
 
+def prefix_in(namespace: str) -> str:
+    """The prefix of one of several cameras, by its namespace: front/wrist gives front_wrist_superquadric_."""
+    return "_".join([*namespace.strip("/").split("/"), PREFIX])
+
+
 def transforms(superquadrics: SuperquadricArray, header: Any, *, prefix: str = PREFIX) -> list[TransformStamped]:
     """One transform for each body that did not fail.
 

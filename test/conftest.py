@@ -18,7 +18,9 @@ import pytest
 import sq_perception
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-_STARTING = {"subprocess", "browser", "running_nodes", "respawned_nodes", "hostile_messages", "sealed_network"}
+_STARTING = {
+    *("subprocess", "browser", "children", "running_nodes", "respawned_nodes", "hostile_messages", "sealed_network")
+}
 """Modules by which tests start processes."""
 
 

@@ -175,11 +175,11 @@ def of_frame(frame: FrameRecovery, label: int, placed: Placed, scene: Tabletop) 
         if body.label == label:
             if body.status == Status.FAILED:
                 return Answer(status="failed", message=body.message)
-            return _answer(body.superquadric, placed, scene, body.sigma_size, body.status.name.lower(), body.message)
+            return answer(body.superquadric, placed, scene, body.sigma_size, body.status.name.lower(), body.message)
     return Answer()
 
 
-def _answer(
+def answer(
     body: Superquadric,
     placed: Placed,
     scene: Tabletop,
@@ -190,7 +190,7 @@ def _answer(
     hull = placed.hull
     turn, place = placed.rotation, placed.translation
     iou = placed.thing.columns.iou(body.transformed(quaternions.from_matrix(turn.T), -turn.T @ place))
-    excess = 2 * body.support(scene.table.T) - np.ptp(hull @ scene.table, axis=0)
+    excess = body.support(scene.table.T) + body.support(-scene.table.T) - np.ptp(hull @ scene.table, axis=0)
     covered = np.full(3, np.nan)
     if sigma is not None and np.isfinite(sigma).all():
         extent = np.ptp(hull @ body.rotation_matrix, axis=0) / 2
@@ -222,12 +222,12 @@ def _simple(points: np.ndarray, placed: Placed, scene: Tabletop) -> dict[str, An
     """What the methods without masks' edges, free space and networks make of a thing's points."""
     if len(points) < FEWEST_POINTS:
         return {name: Answer(status="failed", message="too few points") for name in ("classic", "oriented box")}
-    answers = {"oriented box": _answer(smallest_box(points), placed, scene)}
+    answers = {"oriented box": answer(smallest_box(points), placed, scene)}
     classic = solina_bajcsy.fit(points)
     if classic.status == Status.FAILED:
         answers["classic"] = Answer(status="failed", message=classic.message)
     else:
-        answers["classic"] = _answer(classic.superquadric, placed, scene)
+        answers["classic"] = answer(classic.superquadric, placed, scene)
     return answers
 
 

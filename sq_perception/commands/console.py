@@ -184,20 +184,6 @@ def add_ignore_masks(command: argparse.ArgumentParser) -> None:
     command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
 
 
-def add_address(command: argparse.ArgumentParser) -> None:
-    """Add the options that tell where a page is served."""
-    add = command.add_argument
-    add(
-        "--host",
-        default="127.0.0.1",
-        metavar="ADDRESS",
-        help="%(default)s, this machine; 0.0.0.0 is open to the network, no password",
-    )
-    # Checked here, as the system counts larger numbers from 0 again.
-    port = at_least(0, 65535)
-    add("--port", type=port, help="port to serve on, 0 for any free one (8080, or the next free one)")
-
-
 def progress() -> Progress:
     """A bar on the standard error, where that is a terminal; to be used as a context manager."""
     from rich.console import Console

@@ -18,7 +18,6 @@ _HELP = "Show what is installed, what is missing, and how to get it; the exit co
 _PACKAGE = Path(__file__).parents[1]
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
-    "view": ("viser",),
     "exr": ("OpenEXR",),
     "cluster": ("distributed",),
     "train": ("torch",),

@@ -54,6 +54,7 @@ examples:
   sq-perception recover thousand_frames/ --jobs 8 --jsonl out.jsonl    # again after Ctrl-C: goes on
   sq-perception recover thousand_frames/ --cluster tcp://10.0.0.1:8786 --jsonl out.jsonl
   sq-perception recover recording/ --track --mcap results.mcap
+  sq-perception recover left.npz right.npz --poses poses.txt --json scene.json
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
 
 a line a body:
@@ -79,6 +80,11 @@ distortion:
 tracking:
   --track follows bodies over the frames of each bag and folder, for a camera that stands still (docs/tracking.md);
   "track" has the numbers of all frames so far.  With --jobs or --cluster each frame is recovered for itself.
+
+several cameras:
+  --poses FILE takes all frames as views of one scene that rests, and prints at the end what they say together, in the
+  world of the poses ("scene" in --json).  FILE has a line a frame as in TUM RGB-D: NAME tx ty tz qx qy qz qw, camera to
+  world in metres; NAME is the frame's file, its topic or its stamp in seconds.
 
 bags:
   --mcap writes what recover_node would have published, and what it would have read (docs/bags.md).
@@ -133,6 +139,7 @@ def main(arguments: Sequence[str]) -> int:
     )
     add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     add("--track", action="store_true", help="follow bodies over the frames of each bag or folder, see below")
+    add("--poses", type=Path, metavar="FILE", help="camera poses of the frames: they show one scene, see below")
     add(
         "--time-budget",
         type=positive,

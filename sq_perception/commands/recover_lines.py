@@ -41,6 +41,13 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
         yield "what to do with them: docs/how_sure.md; -v shows more of each body"
 
 
+def scene_lines(scene: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """The bodies of all frames together, in the world of their camera poses."""
+    for body in scene:
+        edges, place = edges_as_text(body["size"], body["sigma_size"], False), place_as_text(body["translation"], False)
+        yield f"  {body['status']} {edges} at {place} id {body['id']}, in {body['seen']} frames"
+
+
 def _line(number: int, body: Mapping[str, Any], is_cube: bool) -> str:
     parts = [str(number), body["status"]]
     if CUT_SHORT in body["message"]:

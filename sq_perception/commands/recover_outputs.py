@@ -23,8 +23,8 @@ from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.tracking.session import Followed
 
 if TYPE_CHECKING:
+    from sq_perception.recordings.html_page import HtmlPage
     from sq_perception.recordings.result_bag import ResultBag
-    from sq_perception.recordings.still_page import StillPage
 
 _FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
@@ -44,6 +44,7 @@ _DECISIVE = (
     "model",
     "ignore_masks",
     "track",
+    "poses",
     "time_budget",
     "max_objects",
 )
@@ -69,7 +70,8 @@ def _decisive(options: argparse.Namespace) -> dict[str, Any]:
     values = {name: getattr(options, name) for name in _DECISIVE}
     sides = values["workspace"]
     values["workspace"] = sides and [side if math.isfinite(side) else None for side in sides]
-    values["masks"] = values["masks"] and str(values["masks"])
+    for name in ("masks", "poses"):
+        values[name] = values[name] and str(values[name])
     return {name: None if value == math.inf else value for name, value in values.items()}
 
 
@@ -82,6 +84,8 @@ class Outputs:
         Elements of ``frames`` that the file of lines had at the beginning.
     results : list
         Elements of ``frames`` that this run adds.
+    scene : list
+        Elements of ``scene``, to be set before the end.
 
     Raises
     ------
@@ -94,18 +98,19 @@ class Outputs:
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
         self.results: list[dict[str, Any]] = []
+        self.scene: list[dict[str, Any]] = []
         self._not_in_bag: list[str] = []
         """Why frames are not in the bag."""
         self._bag: ResultBag | None = None
-        self._page: StillPage | None = None
+        self._page: HtmlPage | None = None
         self._lines = _lines(options)
         self.done = [] if self._lines is None else self._lines.done
         try:
             self._bag = _bag(options)
             if options.html:
-                from sq_perception.recordings.still_page import StillPage
+                from sq_perception.recordings.html_page import HtmlPage
 
-                self._page = StillPage(options.html)
+                self._page = HtmlPage(options.html)
         except BaseException:  # nothing is left of those that were begun
             for output in (self._lines, self._bag, self._page):
                 if output is not None:
@@ -167,7 +172,7 @@ class Outputs:
             yield f"--mcap: {len(self._not_in_bag)} of the frames are not in it: {self._not_in_bag[0]}"
         entries = [*self.done, *self.results]
         for name, text in (
-            ("json", lambda: result_json.document(_decisive(self._options), entries)),
+            ("json", lambda: result_json.document(_decisive(self._options), entries, self.scene)),
             ("csv", lambda: result_json.table(entries)),
         ):
             if getattr(self._options, name) == console.STANDARD_OUTPUT:
@@ -201,7 +206,7 @@ def _lines(options: argparse.Namespace) -> result_json.ResultLines | None:
         return None
     path = "/dev/stdout" if options.jsonl == console.STANDARD_OUTPUT else options.jsonl
     lines = result_json.ResultLines(path, _decisive(options))
-    needing = [name for name in ("track", "mcap", "html") if getattr(options, name)]
+    needing = [name for name in ("track", "poses", "mcap", "html") if getattr(options, name)]
     if lines.done and needing:
         lines.close()
         raise ValueError(f"--jsonl: {path} has {len(lines.done)} frames already, and --{needing[0]} needs all")

@@ -11,18 +11,20 @@ from typing import Any
 
 from sq_perception.commands import console
 from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, failed, misused
-from sq_perception.commands.recover_lines import lines
+from sq_perception.commands.recover_lines import lines, scene_lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
 from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
+from sq_perception.recordings.camera_poses import CameraPoses
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recordings.tracks import RecordedTracks, sequence_of
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.recovery.still_scene import StillScene
 
 
 def run(options: argparse.Namespace) -> int:
@@ -31,6 +33,8 @@ def run(options: argparse.Namespace) -> int:
         return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
         return misused("--json, --jsonl, --csv: only one of them can be the standard output")
+    if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
+        return misused("--poses: expected a pinhole camera, and a method that says how sure it is: auto or symmetry")
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
     try:
@@ -40,11 +44,12 @@ def run(options: argparse.Namespace) -> int:
     except ValueError as error:
         return misused(str(error))
     code = this.over_all_frames()
+    this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
         complain(problem)
         code = code or FAILURE
     if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
-        for line in lines(this.outputs.results, options.verbose):
+        for line in (*lines(this.outputs.results, options.verbose), *scene_lines(this.outputs.scene)):
             print(line)
     if not options.quiet:
         complain(this.summary())
@@ -105,7 +110,9 @@ class RecoverRun:
         self._executor = self._chosen_executor()
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
-        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
+        poses = CameraPoses(options.poses) if options.poses else None
+        is_tracked = options.track or poses is not None
+        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}"), poses) if is_tracked else None
         self._unreadable = 0
         self._warnings: dict[str, set[str]] = {}
 
@@ -142,6 +149,10 @@ class RecoverRun:
         self.is_whole = True
         return FAILURE if self._unreadable else console.SUCCESS
 
+    def scene(self) -> list[dict[str, Any]]:
+        """The bodies of all frames together, with camera poses."""
+        return [result_json.scene_entry(track) for track in self._tracks.scene] if self._tracks else []
+
     def summary(self) -> str:
         """The run in one line."""
         entries = self.outputs.results
@@ -167,7 +178,7 @@ class RecoverRun:
             works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
             yield from workers.recovered(works, executor)
             return
-        previous: FrameRecovery | None = None
+        scene = StillScene(executor)
         sequence, is_warm = ("", ""), False
         for pair in pairs:
             answer: Any = None
@@ -177,10 +188,10 @@ class RecoverRun:
                         executor.warm_up(frame.camera)
                         is_warm = True
                     if sequence != (of_frame := sequence_of(pair[0], frame)):
-                        sequence, previous = of_frame, None
+                        sequence, scene = of_frame, StillScene(executor)
                     work = self._work(frame)
-                    answer = executor.recover(work.depth, work.camera, work.labels, work.options, previous)
-                    previous = answer if self._tracks else None
+                    following = scene if self._tracks else executor
+                    answer = following.recover(work.depth, work.camera, work.labels, work.options)
                 except (ValueError, ArithmeticError) as error:
                     answer = error
             yield pair, answer

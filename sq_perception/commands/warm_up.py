@@ -34,6 +34,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     from sq_perception.grasping import planner
     from sq_perception.imaging import raycast
     from sq_perception.imaging.camera import Camera
+    from sq_perception.recovery import still_scene
     from sq_perception.recovery.recoverer import Recoverer
     from sq_perception.segmentation import segments
     from sq_perception.simulation import scenes, view_rendering
@@ -57,6 +58,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),
         ("segmentation", segments.warm_up),
+        ("still scenes", still_scene.warm_up),
         ("tracking", association.warm_up),
         ("grasps", planner.warm_up),
         ("a whole recovery", recover),

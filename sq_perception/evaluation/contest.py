@@ -14,29 +14,26 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit
 from sq_perception.evaluation.protocol import FITS
-from sq_perception.evaluation.thesis_images import ImageChunk, ThesisImages
+from sq_perception.evaluation.thesis_images import CAMERA, ThesisImages
 from sq_perception.files.output_file import free_name
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import LOSSES
 from sq_perception.learning.inference import Predictor
 from sq_perception.learning.losses import Objective
-from sq_perception.learning.network_config import RegressorConfig
-from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import FrameRecovery, Method, Recoverer
 from sq_perception.segmentation import segments
 
 TIMED_IMAGES = 300
@@ -44,29 +41,15 @@ _NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0,
 """Stands in for a body where nothing was recovered; it is outside of the cube."""
 
 
-@dataclass(frozen=True, eq=False)
-class Answers:
+class Answers(NamedTuple):
     """What a contestant recovered from n images.
 
-    Attributes
-    ----------
-    bodies : Superquadric
-        Batch (n,) in the cube frame.
-    recovered : bool (n,)
-        False where there is no body; the one in ``bodies`` then means nothing.
-    milliseconds : (n,)
-        Execution time of each image, NaN where it was not measured.
+    ``bodies`` (n, 12) are flat in the cube frame, NaN where nothing was recovered; ``milliseconds`` (n,) the time of
+    each image, NaN where it was not measured.
     """
 
-    bodies: Superquadric
-    recovered: np.ndarray
+    bodies: np.ndarray
     milliseconds: np.ndarray
-
-    @classmethod
-    def of(cls, bodies: Sequence[Superquadric | None], milliseconds: np.ndarray) -> Answers:
-        """Answers of single bodies, None where nothing was recovered."""
-        flat = np.array([_NOBODY if body is None else body.to_flat() for body in bodies])
-        return cls(Superquadric.from_flat(flat), np.array([body is not None for body in bodies]), milliseconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +65,7 @@ class Contestant:
     loss : str
         What a network was trained by; empty where its file does not name it, and for fits.
     recover
-        One body an image; the truth in the chunk is not looked at.
+        Answers for depth images (n, 256, 256), given the number of the first within the test set.
     has_canonical_labels : bool
         Whether labels are in canonical form.
     notes : dict
@@ -92,7 +75,7 @@ class Contestant:
     name: str
     description: str
     loss: str
-    recover: Callable[[ImageChunk], Answers]
+    recover: Callable[[int, np.ndarray], Answers]
     has_canonical_labels: bool = True
     notes: dict[str, Any] = field(default_factory=dict)
 
@@ -135,7 +118,7 @@ def network(path: Path, name: str | None = None) -> Contestant:
         name or default_name(path),
         ", ".join(parts),
         loss,
-        partial(_predicted, model, Recoverer(path, method="network")),
+        partial(_predict, model, Recoverer(path, method="network")),
         training.get("canonical_labels", False),
         {"model": str(path), "training": training, "metrics": metrics},
     )
@@ -143,41 +126,39 @@ def network(path: Path, name: str | None = None) -> Contestant:
 
 def fit(method: Method) -> Contestant:
     """A method of the recovery with a fit; raises CheckpointError if its network is needed and cannot be read."""
-    return Contestant(method, FITS[method], "", partial(_fitted, method, Recoverer(method=method)))
+    return Contestant(method, FITS[method], "", partial(_fit, Recoverer(method=method)))
 
 
-def _predicted(model: Predictor, recoverer: Recoverer, images: ImageChunk) -> Answers:
-    bodies: list[Superquadric | None] = [None] * len(images)
-    views = {k: view for k, depth in enumerate(images.depth) if (view := _largest(model.config, depth, images.camera))}
+def _predict(model: Predictor, recoverer: Recoverer, first: int, images: np.ndarray) -> Answers:
+    bodies, views = np.full((len(images), 12), np.nan), {}
+    for k, depth in enumerate(images):
+        found = segments.segment(depth, CAMERA)
+        if found.ids:  # what a network is shown of the largest object, as in a recovery
+            views[k] = model.config.view_of(depth, found.labels == found.ids[0], CAMERA)
     if views:
         predicted = model.predict(np.stack([view.marked for view in views.values()]))
         for (k, view), body in zip(views.items(), predicted, strict=True):
-            bodies[k] = unit_cube.cube_from_optical(view.from_canonical(body))
-    if images.first == 0:
-        recoverer.warm_up(images.camera)
+            bodies[k] = unit_cube.cube_from_optical(view.from_canonical(body)).to_flat()
     milliseconds = np.full(len(images), np.nan)
-    for k in range(min(len(images), TIMED_IMAGES - images.first)):
-        milliseconds[k] = recoverer.recover(images.depth[k], images.camera).milliseconds["total"]
-    return Answers.of(bodies, milliseconds)
+    timed = images[: max(0, TIMED_IMAGES - first)]
+    milliseconds[: len(timed)] = [frame.milliseconds["total"] for frame in _frames(recoverer, first, timed)]
+    return Answers(bodies, milliseconds)
 
 
-def _largest(form: RegressorConfig, depth: np.ndarray, camera: Camera) -> CanonicalView | None:
-    """What a network is shown of an image's largest object, as in a recovery; None where nothing is found."""
-    found = segments.segment(depth, camera)
-    return form.view_of(depth, found.labels == found.ids[0], camera) if found.ids else None
-
-
-def _fitted(method: Method, recoverer: Recoverer, images: ImageChunk) -> Answers:
-    if images.first == 0:
-        recoverer.warm_up(images.camera)
-    bodies: list[Superquadric | None] = [None] * len(images)
-    milliseconds = np.empty(len(images))
-    for k, depth in enumerate(images.depth):
-        frame = recoverer.recover(depth, images.camera, options=RecoveryOptions(method=method))
+def _fit(recoverer: Recoverer, first: int, images: np.ndarray) -> Answers:
+    bodies, milliseconds = np.full((len(images), 12), np.nan), np.empty(len(images))
+    for k, frame in enumerate(_frames(recoverer, first, images)):
         milliseconds[k] = frame.milliseconds["total"]
         if frame.bodies and frame.bodies[0].status != Status.FAILED:
-            bodies[k] = unit_cube.cube_from_optical(frame.bodies[0].superquadric).canonical_form()
-    return Answers.of(bodies, milliseconds)
+            bodies[k] = unit_cube.cube_from_optical(frame.bodies[0].superquadric).canonical_form().to_flat()
+    return Answers(bodies, milliseconds)
+
+
+def _frames(recoverer: Recoverer, first: int, images: np.ndarray) -> Iterator[FrameRecovery]:
+    if first == 0:
+        recoverer.warm_up(CAMERA)
+    for depth in images:
+        yield recoverer.recover(depth, CAMERA)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,18 +195,19 @@ def compare(
         if not 1 <= count <= images.count:
             raise ValueError(f"{contestant.name}: expected 1 to {images.count} bodies, got {count}")
     answers: list[list[Answers]] = [[] for _ in contestants]
-    for piece in images.chunks():
+    for first, depth in images.chunks():
         for (contestant, count), mine in zip(contestants, answers, strict=True):
-            shown = piece.head(count - piece.first)
+            shown = depth[: max(0, count - first)]
             if len(shown):
-                mine.append(contestant.recover(shown))
+                mine.append(contestant.recover(first, shown))
                 if advance:
-                    advance(contestant.name, shown.first + len(shown))
+                    advance(contestant.name, first + len(shown))
     outcomes = []
     for (contestant, count), mine in zip(contestants, answers, strict=True):
-        recovered, milliseconds = np.concatenate([[each.recovered, each.milliseconds] for each in mine], axis=1)
+        flat, milliseconds = (np.concatenate(parts) for parts in zip(*mine, strict=True))
+        recovered = np.isfinite(flat).all(axis=1)
         labels = contestant.labels(images.truth[:count])
-        bodies = Superquadric.from_flat(np.concatenate([each.bodies.to_flat() for each in mine]))
+        bodies = Superquadric.from_flat(np.where(recovered[:, None], flat, _NOBODY))
         bodies = contestant.with_given(bodies, labels)
         outcomes.append(Outcome(contestant, FiguresOfMerit.of(bodies, labels, recovered, milliseconds), bodies, labels))
     return outcomes

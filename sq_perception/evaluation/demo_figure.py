@@ -1,71 +1,53 @@
-"""The picture of the demonstration: what the camera saw, what was made of it, and how that lies in space.
-
-Above, the depth image and the recovered outlines on it.  Below, the bodies of both methods from another place, with the
-true bodies as wires.  Bodies are given in the optical frame.
-"""
+"""The picture of the demonstration: the image and its true bodies, and what each method made of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.geometry.mesh import outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.segments import segment
 
-_VIEWS = ((22, 32, "turned by 32 degrees"), (14, 90, "from the right"))
+_GREY = np.array([[0.62, 0.66, 0.7]])
 
 
 def demo_figure(
     depth: np.ndarray,
     camera: Camera,
     truth: Sequence[Superquadric],
-    methods: Sequence[tuple[str, Sequence[Superquadric], str]],
-    plane: np.ndarray | None,
-    heading: str,
-    unit: str = "m",
+    methods: Mapping[str, Sequence[Superquadric]],
 ) -> Figure:
-    """The figure.
+    """A column for the image and its true bodies, and one a method: outlines above, bodies in space below.
 
     Parameters
     ----------
     depth : (height, width)
         Metres, NaN for no reading.
-    truth
-        Single bodies; empty for a recording.
-    methods
-        The two methods: title, bodies in the order of the truth where there is one, and a remark.
-    plane : (4,), optional
-        Support plane n.p + d = height.
+    truth, methods
+        Single bodies in the optical frame, those of the methods by title.
     """
-    figure = plots.new_figure(15.0, 8.5)
+    columns = {"true bodies": truth, **methods}
+    figure = plots.new_figure(5.0 * len(columns), 8.6)
     wires = [line for body in truth for line in outline(body, 64)]
-    figure.text(0.02, 0.958, heading, fontsize=15, weight="bold", color=plots.INK)
-    if truth:
-        figure.text(0.98, 0.958, "wires: the true bodies", fontsize=11, color=plots.WIRE, ha="right")
-    rows = figure.add_gridspec(2, 1, left=0.02, right=0.98, top=0.905, bottom=0.02, hspace=0.12)
-    above, below = rows[0].subgridspec(1, 3, wspace=0.03), rows[1].subgridspec(1, 4, wspace=0.02)
-
-    window = plots.window_of([body for _, bodies, _ in methods for body in bodies], camera)
-    limits = plots.span_within(depth, window)
-    ax = figure.add_subplot(above[0])
-    plots.draw_depth(ax, depth, limits)
-    left, right, top, bottom = window
-    ax.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=plots.FAINT, lw=1.0, ls="--"))
-    plots.heading_of(ax, "Depth image", f"{camera.width} x {camera.height}, {limits[0]:.2f} to {limits[1]:.2f} {unit}")
-    for k, (name, bodies, remark) in enumerate(methods):
-        ax = figure.add_subplot(above[1 + k])
-        plots.draw_depth(ax, depth, limits, window)
-        plots.draw_outlines(ax, bodies, camera, width=1.8)
-        plots.heading_of(ax, name, remark)
-    for k, (name, bodies, _) in enumerate(methods):
-        for i, (elevation, azimuth, direction) in enumerate(_VIEWS):
-            ax = figure.add_subplot(below[2 * k + i])
-            draw_bodies_3d(ax, list(bodies), plane=plane, elevation=elevation, azimuth=azimuth, unit=unit, wires=wires)
-            plots.heading_of(ax, name if i == 0 else "", direction)
+    figure.text(
+        0.015, 0.955, "Superquadrics recovered from one depth image", fontsize=15, weight="bold", color=plots.INK
+    )
+    grid = figure.add_gridspec(2, len(columns), left=0.015, right=0.985, top=0.9, bottom=0.01, wspace=0.05, hspace=0.1)
+    window = plots.window_of(truth, camera)
+    limits, plane = plots.span_within(depth, window), segment(depth, camera).plane
+    for k, (title, bodies) in enumerate(columns.items()):
+        above, below = figure.add_subplot(grid[0, k]), figure.add_subplot(grid[1, k])
+        plots.draw_depth(above, depth, limits, window)
+        if k:
+            plots.draw_outlines(above, bodies, camera, width=1.8)
+        plots.heading_of(above, title if k else "depth image", "" if k else f"{limits[0]:.2f} to {limits[1]:.2f} m")
+        look = {"wires": wires} if k else {"colours": _GREY}
+        draw_bodies_3d(below, bodies, plane=plane, elevation=25, azimuth=40, **look)
+        plots.heading_of(below, title, "wires: the true bodies" if k else "seen from the side")
     return figure

@@ -18,7 +18,7 @@ from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.contest import Outcome
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
-from sq_perception.evaluation.thesis_images import ThesisImages
+from sq_perception.evaluation.thesis_images import CAMERA, ThesisImages
 from sq_perception.geometry.mesh import outline
 from sq_perception.imaging import raycast, unit_cube
 
@@ -98,9 +98,9 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
     depth = images.image(number)
     is_recovered = bool(np.isfinite(outcome.figures.delta_a[number]))
     predicted = unit_cube.optical_from_cube(outcome.bodies[number])
-    rendered = raycast.render(predicted, images.camera)[0] if is_recovered else np.full_like(depth, np.nan)
+    rendered = raycast.render(predicted, CAMERA)[0] if is_recovered else np.full_like(depth, np.nan)
     shown = np.argwhere(np.isfinite(depth) | np.isfinite(rendered))[:, ::-1].astype(float)
-    window = plots.window_of([], images.camera, shown)
+    window = plots.window_of([], CAMERA, shown)
     limits = plots.span_within(depth, window)
     for ax, image in zip(axes, (depth, rendered), strict=False):
         plots.draw_depth(ax, image, limits, window)

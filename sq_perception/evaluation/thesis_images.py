@@ -6,8 +6,6 @@ the centre at 128 +- 40, uniform rotations; images of 256 x 256 pixels whose gre
 Seeds.  Bodies come in blocks of 500, block b from the generator of ``SeedSequence(seed, spawn_key=(6, b))``, so that
 the first n bodies are the same however many are drawn.  Training draws from ``[seed, step]`` and validates on ``0``: no
 spawn key, hence other numbers for every seed.
-
-Images are rendered chunk by chunk and forgotten; a chunk of 200 takes 50 MB.
 """
 
 from __future__ import annotations
@@ -21,67 +19,26 @@ import numpy as np
 from sq_perception.evaluation.protocol import DEFAULT_SEED
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import thesis_bodies
 
+CAMERA = unit_cube.camera()
+"""The orthographic camera of all images."""
 CHUNK = 200
-"""Images in memory at a time; changes no result."""
+"""Images in memory at a time, 50 MB; changes no result."""
 _BLOCK = 500
 _SPAWN_KEY = 6
 
 
-@dataclass(frozen=True, eq=False)
-class ImageChunk:
-    """Consecutive bodies of the test set with their images.
-
-    Attributes
-    ----------
-    first : int
-        Number of the first body within the test set.
-    truth : Superquadric
-        Batch (n,) in the cube frame.
-    depth : float32 (n, height, width)
-        Depth of the unit cube's camera, 255 steps a unit, NaN for background.
-    camera : Camera
-    """
-
-    first: int
-    truth: Superquadric
-    depth: np.ndarray
-    camera: Camera
-
-    def __len__(self) -> int:
-        return len(self.depth)
-
-    def head(self, count: int) -> ImageChunk:
-        """The first ``count`` of these images; all of them where there are no more."""
-        count = max(count, 0)
-        return ImageChunk(self.first, self.truth[:count], self.depth[:count], self.camera)
-
-
 @dataclass(frozen=True)
 class ThesisImages:
-    """The test set of ``count`` bodies; see the module.
-
-    Raises
-    ------
-    ValueError
-        For fewer than one body, or a negative seed.
-    """
+    """The test set of ``count`` bodies; a ValueError for fewer than one, or a negative seed."""
 
     count: int
     seed: int = DEFAULT_SEED
 
     def __post_init__(self) -> None:
-        if self.count < 1:
-            raise ValueError(f"count: expected at least 1 body, got {self.count}")
-        if self.seed < 0:
-            raise ValueError(f"seed: expected a number of at least 0, got {self.seed}")
-
-    @property
-    def camera(self) -> Camera:
-        """The orthographic camera of all images."""
-        return unit_cube.camera()
+        if self.count < 1 or self.seed < 0:
+            raise ValueError(f"expected at least 1 body and a seed of at least 0, got {self.count}, seed {self.seed}")
 
     @cached_property
     def truth(self) -> Superquadric:
@@ -94,12 +51,10 @@ class ThesisImages:
 
     def image(self, number: int) -> np.ndarray:
         """Depth float32 (256, 256) of one body, NaN for background."""
-        depth, _ = raycast.render(unit_cube.optical_from_cube(self.truth[number]), self.camera)
+        depth, _ = raycast.render(unit_cube.optical_from_cube(self.truth[number]), CAMERA)
         return unit_cube.depth_from_grey(unit_cube.grey_from_depth(depth))
 
-    def chunks(self) -> Iterator[ImageChunk]:
-        """All bodies with their images, some at a time."""
+    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
+        """All images, some at a time: the number of the first body, and depth (n, 256, 256)."""
         for first in range(0, self.count, CHUNK):
-            numbers = range(first, min(first + CHUNK, self.count))
-            depth = np.stack([self.image(number) for number in numbers])
-            yield ImageChunk(first, self.truth[first : numbers.stop], depth, self.camera)
+            yield first, np.stack([self.image(number) for number in range(first, min(first + CHUNK, self.count))])

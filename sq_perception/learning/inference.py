@@ -11,6 +11,7 @@ torch is imported where it computes.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -25,6 +26,7 @@ from sq_perception.geometry.threads import one_torch_thread
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
+from sq_perception.learning.mirror_images import predicted_both_ways
 from sq_perception.learning.network_config import (
     MaskConfig,
     RegressorConfig,
@@ -129,13 +131,13 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     """
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
-        return forward.CompactRegressor(config, weights)
+        return _BothWays(forward.CompactRegressor(config, weights))
     try:
         model = checkpoint.load(path, device).for_inference()
     except ModuleNotFoundError as error:
         what = f"a network of the backbone {config.backbone} on {device}"
         raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
-    return _OnOneThread(model) if _is_cpu(device) else model
+    return _BothWays(_OnOneThread(model) if _is_cpu(device) else model)
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
@@ -162,6 +164,17 @@ def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
 
 
+class _BothWays:
+    """A predictor of bodies that is shown each view and its mirror image, as one batch."""
+
+    def __init__(self, model: Predictor) -> None:
+        self.config = model.config
+        self._model = model
+
+    def predict(self, views: np.ndarray) -> Superquadric:
+        return predicted_both_ways(self._model.predict, checked_views(views, self.config))
+
+
 class _OnOneThread:
     """A predictor of torch: on busy cores the slowest of several threads sets the time, and one image is small."""
 
@@ -184,21 +197,16 @@ def checked_device(device: str) -> str:
     Raises
     ------
     ValueError
-        If it is not the cpu and there is no torch, or torch does not know the name or sees no such device.
+        If it is none of cpu, cuda and cuda:N, or not the cpu and there is no torch, or torch sees no such device.
     """
     if device == "cpu":
         return device
+    if (known := re.fullmatch(r"(cpu|cuda)(?::(\d+))?", device)) is None:
+        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
     try:
         import torch
     except ModuleNotFoundError as error:
         raise ValueError(f"device: {device!r} {NEEDS_TORCH}") from error
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise ValueError(f"device: {error}") from error
-    if kind not in ("cpu", "cuda"):
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
-    if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
-        count = torch.cuda.device_count()
+    if known[1] == "cuda" and int(known[2] or 0) >= (count := torch.cuda.device_count()):
         raise ValueError(f"device: {device!r} was asked for, but torch sees {count} CUDA devices here")
     return device

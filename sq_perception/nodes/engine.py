@@ -26,8 +26,10 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.recovery import still_scene
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
+from sq_perception.recovery.still_scene import Reference, StillScene
 from sq_perception.segmentation.options import Pose
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -99,8 +101,8 @@ class Engine:
         self._node = node
         self._lock = threading.Lock()
         self._built: _Built | None = None
-        self._last: dict[Hashable, FrameRecovery] = {}
-        """The last frame's bodies, by its frame_id and their origin."""
+        self._last: dict[Hashable, Reference] = {}
+        """What the last frame left to the next, by its frame_id and origin."""
         self._request = 0
         self._is_to_read = False
         """Whether weights that were asked for have not been read yet."""
@@ -166,10 +168,11 @@ class Engine:
         method = built.parameters.method  # others may be set already, and still in the making
         origin = built.weights, method
         key = frame.header.frame_id, origin
-        previous = self._last.get(key) if parameters.tracking else None
+        last = self._last.get(key) if parameters.tracking else None
         options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, previous)
-        self._last = {key: recovery}
+        scene = StillScene(built.recoverer, last)
+        recovery = scene.recover(frame.depth, frame.camera, frame.labels, options)
+        self._last = {} if scene.last is None else {key: scene.last}
         return recovery, origin
 
     @property
@@ -221,6 +224,7 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
     with TURNS.turn():
         if not is_wanted():
             return None
+        still_scene.warm_up()
         recoverer.warm_up(unit_cube.camera() if parameters.projection == "orthographic" else WARM_UP_CAMERA)
     return _Built(recoverer, parameters, weights, key)
 

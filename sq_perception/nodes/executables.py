@@ -4,18 +4,46 @@ Each imports its node inside :func:`sq_perception.nodes.process.run`: numba and 
 a Ctrl-C meanwhile must end the process without a traceback.
 """
 
+# ruff: noqa: E402 - the imports below take long enough for a Ctrl-C
 from __future__ import annotations
+
+import signal
+import sys
+
+PROGRAMS = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
+
+if sys.argv[0].rpartition("/")[2] in PROGRAMS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # Until process.run takes over, in this program alone: Python's own handler would raise in the midst of imports.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import argparse
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from sq_perception.nodes import process
+from sq_perception.nodes import fast_dds, process
 
-_CAMERAS = """\
-recover_cameras: one process with a recover_node for each of several cameras, which share one network.
+_USAGE = "ros2 run sq_perception %(prog)s{} [--ros-args -p NAME:=VALUE --params-file FILE -r TOPIC:=OTHER ...]"
+_ABOUT = {
+    "recover_node": """\
+Depth images in, superquadrics out.
+
+takes      depth/image and depth/camera_info, or depth/points; mask/image if there are masks
+publishes  ~/superquadrics ~/markers ~/rendered_depth ~/support_plane /diagnostics
+services   ~/enable ~/trigger ~/recover, and those of a lifecycle node""",
+    "fitter_node": "recover_node with the classic fit of Solina and Bajcsy, with the same topics.",
+    "grasp_node": """\
+Superquadrics in, grasps of a parallel gripper out.
+
+takes      superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
+publishes  ~/grasps ~/grasp_details ~/markers /diagnostics
+services   ~/plan, ~/plan_grasps where moveit_msgs is installed, and those of a lifecycle node""",
+    "synthetic_depth_node": """\
+A simulated depth camera, or recorded frames.
+
+publishes  depth/image depth/camera_info mask/image ~/truth""",
+    "recover_cameras": """\
+One process with a recover_node for each of several cameras, which share one network.
 
     ros2 run sq_perception recover_cameras front wrist --ros-args --params-file cameras.yaml
 
@@ -23,13 +51,16 @@ makes /front/recover_node and /wrist/recover_node, which take /front/depth/image
 Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_node: for one.
 
 Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
-once each and let them compete for the same cores."""
+once each and let them compete for the same cores.""",
+}
 _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 """Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
 
 
 def _run(name: str, arguments: Sequence[str] | None = None) -> int:
-    return process.run(name, lambda: [_node(name)], arguments)
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    _parser(name).parse_args(_before_ros(given))
+    return process.run(name, lambda: [create_node(name)], given)
 
 
 recover_node = partial(_run, "recover_node")
@@ -41,19 +72,17 @@ synthetic_depth_node = partial(_run, "synthetic_depth_node")
 def recover_cameras(arguments: Sequence[str] | None = None) -> int:
     """A recover_node for each camera of the command line."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    cut = given.index("--ros-args") if "--ros-args" in given else len(given)
-    parser = argparse.ArgumentParser(
-        prog="recover_cameras", description=_CAMERAS, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = _parser("recover_cameras", " CAMERA ...")
     parser.add_argument("cameras", nargs="+", metavar="CAMERA", type=_namespace, help="namespace of a camera")
-    cameras = parser.parse_args(given[:cut]).cameras
+    ours = _before_ros(given)
+    cameras = parser.parse_args(ours).cameras
     if len(set(cameras)) != len(cameras):
         parser.error(f"expected different cameras, got {' '.join(cameras)}")
 
     def create() -> Iterator[process.Stoppable]:
         names: dict[str, str] = {}
         for camera in cameras:
-            node = _node("recover_node", camera)
+            node = create_node("recover_node", camera)
             yield node
             other = names.setdefault(node.get_fully_qualified_name(), camera)
             if other != camera:
@@ -62,10 +91,29 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
                     f"(__ns) replaces those of the cameras; write robot/{other} robot/{camera} instead"
                 )
 
-    return process.run("recover_cameras", create, given[cut:])
+    return process.run("recover_cameras", create, given[len(ours) :])
 
 
-def _node(name: str, namespace: str | None = None) -> process.Stoppable:
+def _before_ros(arguments: list[str]) -> list[str]:
+    """What is not for ROS."""
+    return arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
+
+
+def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
+    """Refuses what a program does not take; its help has the parameters with their defaults."""
+    kind = name.replace("recover_cameras", "recover_node")
+    parameters = fast_dds.configuration_file(f"{kind}.yaml").read_text(encoding="utf-8")
+    return argparse.ArgumentParser(
+        prog=name,
+        usage=_USAGE.format(positional),
+        description=_ABOUT[name],
+        epilog=parameters.replace("%", "%%"),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
+    """One of this package's nodes, by the name of its program."""
     if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 
@@ -74,11 +122,14 @@ def _node(name: str, namespace: str | None = None) -> process.Stoppable:
         from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
 
         return process.made(SyntheticDepthNode, name)
+    from sq_msgs_py.transforms import prefix_in
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 
     parameters = FitterParameters if name == "fitter_node" else RecoverParameters
-    return process.made(FrameNode, name, parameters, namespace=namespace)
+    # Bodies of two cameras must not have one name.
+    own = {} if namespace is None else {"tf_prefix": prefix_in(namespace)}
+    return process.made(FrameNode, name, parameters, namespace=namespace, defaults=own)
 
 
 def _namespace(text: str) -> str:

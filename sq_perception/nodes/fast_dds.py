@@ -26,13 +26,18 @@ LEAST_AGE = 10.0
 _LOCK = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
 
 
-def profile_path() -> Path:
-    """The shipped profile: beside the package's modules where it is installed, ``config/`` in a source tree."""
+def configuration_file(name: str) -> Path:
+    """A shipped file: beside the package's modules where it is installed, in ``config/`` of a source tree."""
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "config", package.parent / "config"):
-        if (folder / _FILE).is_file():
-            return folder / _FILE
-    raise FileNotFoundError(f"{_FILE} is missing beside {package}: install the package again")
+        if (folder / name).is_file():
+            return folder / name
+    raise FileNotFoundError(f"{name} is missing beside {package}: install the package again")
+
+
+def profile_path() -> Path:
+    """The shipped profile."""
+    return configuration_file(_FILE)
 
 
 def additions() -> dict[str, str]:

@@ -17,8 +17,10 @@ from __future__ import annotations
 import math
 import threading
 import traceback
+from collections.abc import Mapping
 from dataclasses import fields
 from time import monotonic, perf_counter
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -37,7 +39,7 @@ from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics
+from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
@@ -46,8 +48,6 @@ from sq_perception.tracking import association
 
 _WORKER_END = 3.0
 """Seconds that a deactivation waits for the frame at hand."""
-_OLDEST = 3600.0
-"""Seconds; the age of an older frame, or one from the future, is no latency: it is of a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 TRIGGER_TIMEOUT = 5.0
@@ -66,7 +66,7 @@ class Outcome(NamedTuple):
 
 
 class FrameNode(ManagedNode):
-    """See the module; ``kind`` is the dataclass of its parameters.
+    """See the module; ``kind`` is the dataclass of its parameters, ``defaults`` are in place of some of its own.
 
     Raises
     ------
@@ -82,11 +82,17 @@ class FrameNode(ManagedNode):
         *,
         namespace: str | None = None,
         context: Any = None,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         super().__init__(name, namespace=namespace, context=context)
         self._engine = Engine(self)
         self._settings: LiveParameters[RecoverParameters] = LiveParameters(
-            self, kind, locked=self._why_locked, check=self._engine.check, changed=self._engine.follow
+            self,
+            kind,
+            locked=self._why_locked,
+            check=self._engine.check,
+            changed=self._engine.follow,
+            defaults=defaults,
         )
         self._statistics = Statistics()
         self._poses = CameraPoses(self)
@@ -107,8 +113,7 @@ class FrameNode(ManagedNode):
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
         self.create_timer(1.0, self._on_second, clock=_STEADY)
-        if self._settings.current.autostart:
-            self.start()
+        self.start(self._settings.current.autostart)
 
     # The lifecycle
 
@@ -265,7 +270,7 @@ class FrameNode(ManagedNode):
                 return None
             self._outputs.answer(shown)
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
-        if abs(age) < _OLDEST:
+        if abs(age) < OLDEST:
             stages["stamp to result"] = 1e3 * age
         self._outputs.accompany(found, shown, frame, parameters, stages)
         self._statistics.answer(stages, found.summary)
@@ -334,7 +339,7 @@ class FrameNode(ManagedNode):
         source, parameters = self._input, self._settings.current
         silent = False
         if source is not None:
-            source.look_for_latched()
+            source.follow_publishers()
             silent = 0 < parameters.no_frame_warning < source.silence
             if silent:
                 text = f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}"
@@ -346,19 +351,12 @@ class FrameNode(ManagedNode):
             tally = self._tracking.tally
             more |= {"tracks": str(tally.tracks), "track ids given": str(tally.births)}
             more |= {"track resets": str(tally.resets), "frames without camera pose": str(tally.without_pose)}
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.status.append(self._statistics.status(self.get_fully_qualified_name(), self._standing(silent), more))
-        self._diagnostics.publish(message)
+        self._diagnostics.publish(self._statistics.report(self, self._standing(silent), more))
 
     def _standing(self, silent: bool) -> Standing | None:
         """The level and message of diagnostics that do not depend on frames, if any."""
-        fault = self.fault or self._engine.fault
-        if not self.is_active:
-            level = DiagnosticStatus.ERROR if fault else DiagnosticStatus.OK
-            return level, f"{self.state}: {fault}" if fault else self.state
-        if fault:
-            return DiagnosticStatus.WARN, fault
+        if (standing := self.standing(self._engine.fault)) is not None:
+            return standing
         if not self._enabled:
             return DiagnosticStatus.OK, "disabled"
         return (DiagnosticStatus.WARN, "no depth images arrive") if silent else None

@@ -6,6 +6,9 @@ What no message holds, measured points and unseen space, is not looked at; the c
 Correlations of a body's numbers are not in the cloud either.  Nor is it told from the cloud whether it is in metres:
 one in the frame ``unit_cube`` is refused, no other one of orthographic images.
 
+``~/plan`` and ``~/plan_grasps`` plan the last cloud again, unless it is older than ``max_age``: where a camera has
+stopped, the bodies may be gone.
+
 Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
 target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.
 """
@@ -14,10 +17,13 @@ from __future__ import annotations
 
 import threading
 from contextlib import suppress
+from time import monotonic
 from typing import Any
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -33,13 +39,15 @@ from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.nodes.frame import latched
+from sq_perception.nodes.frame import latched, stamp_of
+from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import ARRIVAL, MarkerIds
 from sq_perception.nodes.parameters import GraspParameters
-from sq_perception.nodes.statistics import THROTTLE
+from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
+from sq_perception.recovery.recovery import timed
 
 _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
 """Columns of a message that are attributes of a grasp of the same name."""
@@ -51,19 +59,25 @@ class GraspNode(ManagedNode):
     def __init__(self, name: str, *, context: Any = None) -> None:
         super().__init__(name, context=context)
         self._settings = LiveParameters(self, GraspParameters)
+        self._statistics = Statistics(what="cloud")
         self._last: PointCloud2 | None = None
+        self._heard_at = monotonic()
+        self._arrival = 0.0
+        """When it came, seconds of the node's clock."""
         self._plane: PoseStamped | None = None
         self._marker_ids = MarkerIds()
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
         self._publishing = threading.Lock()
         """Held while something is published, or nothing is any more."""
-        self._inputs: list[Any] = []
+        self._clouds: Listener | None = None
+        self._planes: Any = None
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/plan", self._on_plan)
         with suppress(ImportError):
             self.create_service(installed("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
-        if self._settings.current.autostart:
-            self.start()
+        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.start(self._settings.current.autostart)
 
     def _configure(self) -> None:
         """Compile or load the kernels, so that no first cloud waits."""
@@ -76,15 +90,16 @@ class GraspNode(ManagedNode):
             self.create_publisher(PointCloud2, "~/grasp_details", 10),
             self.create_publisher(MarkerArray, "~/markers", 10),
         ]
-        self._inputs = [
-            self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched()),
-            self.create_subscription(PointCloud2, "superquadrics", self._on_cloud, 1),
-        ]
+        self._planes = self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched())
+        self._heard_at = monotonic()
+        self._clouds = Listener(self, PointCloud2, "superquadrics", self._on_cloud, self._statistics)
+        self.get_logger().info(f"ready, listening to {self._clouds.topic}")
 
     def _deactivate(self) -> None:
-        for subscription in self._inputs:
-            self.destroy_subscription(subscription)
-        self._inputs = []
+        clouds, self._clouds = self._clouds, None
+        if clouds is not None:
+            clouds.close()
+            self.destroy_subscription(self._planes)
         with self._publishing:
             if self._outputs and self._last is not None and self.context.ok():
                 shown = self._outputs[-1]
@@ -101,8 +116,39 @@ class GraspNode(ManagedNode):
         self._plane = message
 
     def _on_cloud(self, message: PointCloud2) -> None:
-        self._last = message
-        self._answered(message)
+        self._last, self._arrival, self._heard_at = message, self._now(), monotonic()
+        self._statistics.count("received")
+        stages: dict[str, float] = {}
+        with timed(stages, "plan"):
+            found, text = self._answered(message)
+        if found is not None:
+            self._statistics.answer(stages, text)
+        elif self._clouds is None:
+            self._statistics.count("dropped")
+        else:
+            self._statistics.refuse(text)
+
+    def _now(self) -> float:
+        return 1e-9 * self.get_clock().now().nanoseconds
+
+    def _age(self, cloud: PointCloud2) -> float:
+        """Seconds since the image of the last cloud; since the cloud came where it has no stamp, or one of another clock."""
+        now, stamp = self._now(), 1e-9 * stamp_of(cloud)
+        since = max(now - self._arrival, 0.0)
+        return max(now - stamp, since) if stamp and now - stamp < OLDEST else since
+
+    def _on_second(self) -> None:
+        clouds, limit, silence = self._clouds, self._settings.current.no_cloud_warning, monotonic() - self._heard_at
+        more, standing = {"state": self.state}, self.standing()
+        if (cloud := self._last) is not None:
+            more["age of the bodies [s]"] = f"{self._age(cloud):.1f}"
+        if clouds is not None:
+            clouds.follow()
+            if 0 < limit < silence:
+                text = f"no superquadrics on {clouds.topic} for {silence:.0f} s: {clouds.publishers}"
+                self.get_logger().warning(text, throttle_duration_sec=THROTTLE)
+                standing = standing or (DiagnosticStatus.WARN, "no superquadrics arrive")
+        self._diagnostics.publish(self._statistics.report(self, standing, more))
 
     def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         cloud = self._last
@@ -119,15 +165,16 @@ class GraspNode(ManagedNode):
         if found is None or cloud is None:
             code.val = code.FAILURE
             return response
-        known = [transforms.name(number) for number in from_message(cloud).recovered.id]
+        settings = self._settings.current
+        known = [transforms.name(number, settings.tf_prefix) for number in from_message(cloud).recovered.id]
         if target and target not in known:
             code.val = code.INVALID_OBJECT_NAME
             code.message = f"target: expected an id among {', '.join(known) or 'none'}, got {target!r}"
             return response
-        hand, plane = gripper(self._settings.current.gripper), self._plane_in(cloud.header)
+        hand, plane = gripper(settings.gripper), self._plane_in(cloud.header)
         up = None if plane is None else plane[:3].tolist()
         each = messages.moveit_grasps(
-            found, cloud.header, hand.link, hand.link_from_tcp, up, transforms.PREFIX, hand.joints
+            found, cloud.header, hand.link, hand.link_from_tcp, up, settings.tf_prefix, hand.joints
         )
         response.grasps = [one for one in each if not target or target in one.allowed_touch_objects]
         code.val = code.SUCCESS if response.grasps else code.PLANNING_FAILED
@@ -136,7 +183,11 @@ class GraspNode(ManagedNode):
     def _planned_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
         if not self.is_active or cloud is None:
             return None, "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
-        return self._answered(cloud)
+        age, limit = self._age(cloud), self._settings.current.max_age
+        if 0 < limit < age:
+            return None, f"the last superquadrics are {age:.1f} s old, and max_age is {limit:g} s"
+        found, text = self._answered(cloud)
+        return found, f"{text}; {age:.1f} s old"
 
     def _plane_in(self, header: Any) -> np.ndarray | None:
         """The last plane, where it is in the frame of that header."""

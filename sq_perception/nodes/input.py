@@ -14,28 +14,23 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import monotonic
-from typing import Any
 
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSReliabilityPolicy, qos_check_compatible
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.nodes import fast_dds
 from sq_perception.nodes.frame import (
     DepthMessage,
     Frame,
     decode,
     image_topic,
     listen_to_latched_info,
-    newest,
     size_of,
     stamp_of,
 )
+from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
@@ -75,8 +70,7 @@ class _Info:
 class Input:
     """The subscriptions of an active node, and what came.
 
-    Inputs are best effort, keep last 1, unless overridden.  An image that comes while none ``is_wanted`` is dropped at
-    once.
+    An image that comes while none ``is_wanted`` is dropped at once.
     """
 
     def __init__(
@@ -103,23 +97,25 @@ class Input:
         """Whether an image has had a camera_info of its own stamp."""
         self._masks: OrderedDict[int, Image] = OrderedDict()
         self._is_closed = False
-        # Of a subscription that another thread destroys meanwhile not even the name can be asked.
-        self._info_topic, self._mask_topic = (
-            str(node.resolve_topic_name(name)) for name in ("depth/camera_info", "mask/image")
-        )
         # Subscriptions are served in this order: what an image needs is there before the image.
-        self._info: Subscription | None = None
+        self._info: Listener | None = None
         if settings.current.projection == "pinhole" and transport != POINTS:
-            self._info = self._listen(CameraInfo, "depth/camera_info", self._on_info)
+            self._info = Listener(node, CameraInfo, "depth/camera_info", self._on_info, statistics)
         self._latched: Subscription | None = None
-        self._mask = self._listen(Image, "mask/image", self._on_mask)
+        self._mask = Listener(node, Image, "mask/image", self._on_mask, statistics)
         kind = {RAW: Image, POINTS: PointCloud2}.get(transport, CompressedImage)
-        self._image = self._listen(kind, self.topic, self._on_image)
+        self._image = Listener(node, kind, self.topic, self._on_image, statistics)
 
-    def look_for_latched(self) -> None:
-        """Hear a camera_info that was published once before, if there is one; called each second."""
+    def follow_publishers(self) -> None:
+        """Hear publishers as they offer, and a camera_info that was published once before; called each second."""
+        for listener in self._listeners:
+            listener.follow()
         if self._info is not None and self._latched is None and not self._is_closed:
-            self._latched = listen_to_latched_info(self._node, self._info_topic, self._on_info)
+            self._latched = listen_to_latched_info(self._node, self._info.topic, self._on_info)
+
+    @property
+    def _listeners(self) -> tuple[Listener, ...]:
+        return tuple(one for one in (self._image, self._mask, self._info) if one is not None)
 
     @property
     def silence(self) -> float:
@@ -129,7 +125,7 @@ class Input:
     @property
     def heard(self) -> str:
         """Who publishes depth images, and whether they can be heard."""
-        return self._publishers_of(self._image)
+        return self._image.publishers
 
     def close(self) -> None:
         """Listen no more, and let the worker go; what waits is dropped."""
@@ -140,9 +136,10 @@ class Input:
             self._ready = None
             self._changed.notify_all()
         self._statistics.count("dropped", left)
-        for subscription in (self._image, self._mask, self._latched, self._info):
-            if subscription is not None:
-                self._node.destroy_subscription(subscription)
+        for listener in self._listeners:
+            listener.close()
+        if self._latched is not None:
+            self._node.destroy_subscription(self._latched)
 
     # For the worker
 
@@ -184,17 +181,17 @@ class Input:
             return frame  # whose pixels are those of no mask
         if use == "always" and arrival.mask is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
-            raise ValueError(f"mask: {expected}, none came on {self._mask_topic}")
+            raise ValueError(f"mask: {expected}, none came on {self._mask.topic}")
         if use == "auto" and arrival.needs_mask and arrival.mask is None:
             self._statistics.count(WITHOUT_MASK)
             self._node.get_logger().warning(
-                f"{self._mask_topic}: no mask with the stamp of the image within {parameters.patience:g} s (patience): "
+                f"{self._mask.topic}: no mask with the stamp of the image within {parameters.patience:g} s (patience): "
                 "segmented here",
                 throttle_duration_sec=THROTTLE,
             )
         return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
 
-    def _calibration_of(self, image: DepthMessage, source: Subscription) -> Calibration:
+    def _calibration_of(self, image: DepthMessage, source: Listener) -> Calibration:
         size = size_of(image)
         with self._changed:
             info = self._info_for(size, stamp_of(image))
@@ -209,7 +206,7 @@ class Input:
         else:
             why = last.fault or size_mismatch(size, last.size)
             fault = f"{wanted}, the last one is for {last.size[0]} x {last.size[1]} ({why})"
-        raise ValueError(f"{fault}, on {source.topic_name}: {self._publishers_of(source)}")
+        raise ValueError(f"{fault}, on {source.topic}: {source.publishers}")
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
@@ -225,7 +222,7 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
-        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask_topic) > 0)
+        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")
@@ -299,48 +296,3 @@ class Input:
         fitting = [info for info in self._infos if info.size == size]
         best = [info for info in fitting if info.stamp == stamp] or fitting
         return best[-1] if best else None
-
-    # Subscriptions
-
-    def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> Subscription:
-        made = self._node.create_subscription(
-            kind,
-            topic,
-            callback,
-            newest(),
-            event_callbacks=SubscriptionEventCallbacks(message_lost=lambda event: self._on_lost(made, event)),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
-        return made
-
-    def _on_lost(self, subscription: Subscription, event: Any) -> None:
-        topic = subscription.topic_name
-        self._statistics.lose(topic, event.total_count_change)
-        if subscription.qos_profile.reliability == QoSReliabilityPolicy.BEST_EFFORT:
-            remedy = (
-                "best effort messages that do not fit into the shared memory which Fast DDS reserves are lost. Start "
-                f"the PUBLISHER (the camera driver) with {fast_dds.VARIABLE}={fast_dds.profile_path()}, or set "
-                f"qos_overrides.{topic}.subscription.reliability to reliable"
-            )
-        else:
-            remedy = (
-                "a reliable publisher's queue was full before they were delivered. Raise the depth of the PUBLISHER "
-                f"(the camera driver), or set qos_overrides.{topic}.subscription.reliability to best_effort"
-            )
-        text = f"{event.total_count} messages of {topic} lost before they arrived: {remedy}"
-        self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE)
-
-    def _publishers_of(self, subscription: Subscription) -> str:
-        """Who publishes a topic, with which quality of service, and whether the subscription can hear it."""
-        parts = []
-        for publisher in self._node.get_publishers_info_by_topic(subscription.topic_name):
-            profile = publisher.qos_profile
-            verdict, why = qos_check_compatible(profile, subscription.qos_profile)
-            offered = ", ".join(
-                policy.name.lower().replace("_", " ") for policy in (profile.reliability, profile.durability)
-            )
-            note = f"; INCOMPATIBLE: {why.strip().rstrip(';')}" if verdict == QoSCompatibility.ERROR else ""
-            name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
-            parts.append(f"{name} ({publisher.topic_type}, {offered}{note})")
-        count = len(parts)
-        return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"

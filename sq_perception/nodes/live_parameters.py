@@ -10,8 +10,9 @@ effect with the next frame.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields, replace
+from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -65,6 +66,8 @@ class LiveParameters(Generic[P]):
         Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
     changed
         Called with the new values and which of them were set.
+    defaults
+        Of this node, in place of the dataclass'.
 
     Raises
     ------
@@ -80,10 +83,11 @@ class LiveParameters(Generic[P]):
         locked: Callable[[], str] | None = None,
         check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
         changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self._kinds: dict[str, Any] = {parameter.name: type(parameter.default) for parameter in fields(kind)}
         self._fixed = {parameter.name for parameter in fields(kind) if not parameter.metadata["live"]}
-        self._locked, self._check, self._changed = locked, check, changed
+        self._locked, self._check, self._changed, self._defaults = locked, check, changed, defaults
         self.current: P = kind(**self._values([self._declared(node, parameter) for parameter in fields(kind)]))
         """The values in force: an immutable set, replaced as a whole."""
         node.add_pre_set_parameters_callback(lambda changes: [self._typed(change) for change in changes])
@@ -92,7 +96,8 @@ class LiveParameters(Generic[P]):
 
     def _declared(self, node: Node, parameter: Field[Any]) -> Parameter:
         # Of any type at first: declared as a double it would refuse an integer given at the start.
-        node.declare_parameter(parameter.name, parameter.default, ParameterDescriptor(dynamic_typing=True))
+        default = self._defaults.get(parameter.name, parameter.default)
+        node.declare_parameter(parameter.name, default, ParameterDescriptor(dynamic_typing=True))
         given = self._typed(node.get_parameter(parameter.name))
         node.set_descriptor(parameter.name, describe(parameter, self._locked is None), given.get_parameter_value())
         return given

@@ -28,6 +28,7 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -89,10 +90,27 @@ class ManagedNode(LifecycleNodeMixin, Node):
         """Whether the node is beyond ``unconfigured``, transitions on the way there included."""
         return self.state not in ("unconfigured", "finalized", "unknown")
 
-    def start(self) -> None:
-        """Configure and activate, now and after a fault; :attr:`start_failure` has the reason of a failure."""
+    def start(self, autostart: bool = True) -> None:
+        """Configure and activate, now and after a fault; :attr:`start_failure` has the reason of a failure.
+
+        Without ``autostart`` only say that somebody else has to.
+        """
+        if not autostart:
+            self.get_logger().info(
+                "unconfigured, as autostart is false: waiting for a lifecycle manager, or for ros2 lifecycle set "
+                f"{self.get_fully_qualified_name()} configure, then activate"
+            )
+            return
         self._starts_itself = True
         self._tasks.put(self._bring_up)
+
+    def standing(self, fault: str = "") -> tuple[bytes, str] | None:
+        """Level and message for diagnostics of a node that is not active, or has a fault; None for one that works."""
+        fault = self.fault or fault
+        if self.is_active:
+            return (DiagnosticStatus.WARN, fault) if fault else None
+        level = DiagnosticStatus.ERROR if fault else DiagnosticStatus.OK
+        return level, f"{self.state}: {fault}" if fault else self.state
 
     def close(self) -> bool:
         """Release everything; called once, before destroy_node.  False if a transition is still at work after a while.

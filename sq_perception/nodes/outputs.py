@@ -125,6 +125,12 @@ class Outputs:
 
     def answer(self, shown: Findings) -> None:
         """Publish plane and point cloud."""
+        if not shown.header.frame_id:
+            self._node.get_logger().warning(
+                "the images have no frame_id, and so have the results: RViz and tf2 cannot place them, and there are "
+                "no transforms or collision objects; the camera driver has to set it",
+                throttle_duration_sec=THROTTLE,
+            )
         if shown.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
             self.support_plane.publish(plane_message(shown.plane, shown.header))
         self.superquadrics.publish(to_message(shown.array, shown.header))
@@ -210,9 +216,6 @@ class OptionalOutputs:
         """
         self.follow(parameters)
         has_frame = bool(found.header.frame_id)
-        if not has_frame and (parameters.publish_tf or parameters.publish_collision_objects):
-            text = "expected images with a frame_id, got none: no transforms, no objects"
-            self._node.get_logger().warning(text, once=True)
         heard = self._heard("publish_tf")
         if has_frame and heard and len(found.array.recovered):
             message: Any = heard.msg_type

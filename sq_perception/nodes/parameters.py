@@ -8,6 +8,7 @@ from typing import Literal, cast, get_args
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS
 from sq_msgs_py.markers import ALPHA
+from sq_msgs_py.transforms import PREFIX
 from sq_perception.grasping.gripper import GRIPPERS
 from sq_perception.grasping.planner import FRICTION, PLACEMENT
 from sq_perception.imaging import compressed_depth
@@ -28,6 +29,20 @@ _KEEPS_ALL = 100.0
 def _check_box(name: str, box: tuple[float, ...]) -> None:
     if len(box) != 6 or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
         raise ParameterError(f"{name}: expected least x, y, z and greater x, y, z in metres, got {list(box)}")
+
+
+def _check_frame(name: str, frame: str) -> None:
+    if frame.startswith("/") or "//" in frame or any(letter.isspace() for letter in frame):
+        raise ParameterError(
+            f"{name}: expected the name of a tf2 frame, without / at the beginning, // or spaces, got {frame!r}"
+        )
+
+
+def _check_prefix(prefix: str) -> None:
+    """Without one a body would be called 7, which no tf2 frame and no collision object should be."""
+    _check_frame("tf_prefix", prefix)
+    if not prefix:
+        raise ParameterError(f"tf_prefix: expected something before the ids, such as {PREFIX}, got nothing")
 
 
 @dataclass(frozen=True)
@@ -117,8 +132,9 @@ class RecoverParameters(Parameters):
     )
     publish_tf: bool = setting(False, "Publish a frame for each body on /tf.")
     tf_prefix: str = setting(
-        "superquadric_",
-        "Names of tf2 frames, detections and collision objects before the id. Two nodes need different ones.",
+        PREFIX,
+        "Names of tf2 frames, detections and collision objects before the id. Two nodes need different ones: those of "
+        "recover_cameras have front_superquadric_ and so on.",
     )
     publish_detections: bool = setting(False, "Publish ~/detections; needs vision_msgs.")
     publish_collision_objects: bool = setting(False, "Publish ~/planning_scene; needs moveit_msgs.")
@@ -174,10 +190,9 @@ class RecoverParameters(Parameters):
                 raise ParameterError(
                     f"{name}: expected {expected or 'none'} for projection = orthographic, got {given}"
                 )
-        for name in ("fixed_frame", "target_frame", "tf_prefix"):
-            frame = getattr(self, name)
-            if frame.startswith("/"):
-                raise ParameterError(f"{name}: expected no / at the beginning, as tf2 allows none, got {frame}")
+        for name in ("fixed_frame", "target_frame"):
+            _check_frame(name, getattr(self, name))
+        _check_prefix(self.tf_prefix)
 
 
 @dataclass(frozen=True)
@@ -267,6 +282,16 @@ class GraspParameters(Parameters):
     """grasp_node."""
 
     autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.", live=False)
+    max_age: float = setting(
+        10.0,
+        "~/plan and ~/plan_grasps refuse when the last bodies are older; 0: never.",
+        unit="s",
+        within=(0.0, 3600.0),
+    )
+    no_cloud_warning: float = setting(
+        5.0, "Warn when no bodies came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
+    )
+    tf_prefix: str = setting(PREFIX, "That of the recover_node: what ~/plan_grasps calls the bodies, before their ids.")
     gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS))
     friction: float = setting(FRICTION, "Least coefficient of friction between pads and things.", within=(0.05, 2.0))
     placement: float = setting(
@@ -289,6 +314,7 @@ class GraspParameters(Parameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_box("region", self.region)
+        _check_prefix(self.tf_prefix)
 
 
 KINDS: dict[str, type[Parameters]] = {

@@ -13,10 +13,13 @@ from datetime import datetime, timezone
 from time import monotonic
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rclpy.node import Node
 
 THROTTLE = 5.0
 """Seconds between two messages of the same place in the log."""
+OLDEST = 3600.0
+"""Seconds; the age of an older message, or one from the future, means nothing: it is of a bag, or another clock."""
 SECONDS = 10.0
 """What rates and latencies are taken over."""
 _MOST = 5000
@@ -31,10 +34,10 @@ Standing = tuple[bytes, str]
 
 
 class Statistics:
-    """Collects from any thread; ``clock`` gives seconds."""
+    """Collects from any thread; ``clock`` gives seconds, ``what`` is one of what is counted."""
 
-    def __init__(self, clock: Callable[[], float] = monotonic) -> None:
-        self._clock, self._started = clock, clock()
+    def __init__(self, clock: Callable[[], float] = monotonic, what: str = "frame") -> None:
+        self._clock, self._started, self._what = clock, clock(), what
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
         self._recent: deque[tuple[float, str]] = deque(maxlen=_MOST)
@@ -69,6 +72,12 @@ class Statistics:
             self._stages.append((self._clock(), milliseconds))
         self.count("answered")
 
+    def report(self, node: Node, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticArray:
+        """The message of :meth:`status` for a node."""
+        message = DiagnosticArray(status=[self.status(node.get_fully_qualified_name(), standing, more)])
+        message.header.stamp = node.get_clock().now().to_msg()
+        return message
+
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
         """The diagnostics of a node, and ``more`` that there is to know beside the frames.
 
@@ -91,9 +100,9 @@ class Statistics:
             level, message = standing
             self._stood = now
         elif counts["refused"] > before["refused"]:
-            message = f"refused a frame: {last_error.partition(' ')[2]}"
+            message = f"refused a {self._what}: {last_error.partition(' ')[2]}"
         elif since > _SLOW and not recently["answered"]:
-            message = f"{len(came)} frames came within {since:.0f} s, none was answered"
+            message = f"{len(came)} {self._what}s came within {since:.0f} s, none was answered"
         elif new := lost - known:
             parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())
             message = f"messages lost before they arrived: {parts}"
@@ -116,5 +125,5 @@ class Statistics:
             median, high = np.percentile([took[stage] for took in stages if stage in took], (50, 95))
             values |= {f"{stage}: median [ms]": f"{median:.2f}", f"{stage}: p95 [ms]": f"{high:.2f}"}
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        about = f"{name.lstrip('/')}: frames"
+        about = f"{name.lstrip('/')}: {self._what}s"
         return DiagnosticStatus(level=level, name=about, message=message, hardware_id=name, values=pairs)

@@ -21,12 +21,14 @@ from typing import Any
 
 from sq_perception.files import output_file
 from sq_perception.files.version import __version__
+from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.recordings.frame_file import RecordedFrame, Stamp
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Followed
+from sq_perception.tracking.tracker import Track
 
 FORMAT, VERSION = "sq_perception.recovery", 1
 UNITS = {"optical": "m", "cube": "1"}
@@ -110,12 +112,24 @@ def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
 
 
 def _parameters(body: Superquadric) -> dict[str, Any]:
-    return {name: getattr(body, name) for name in ("size", "shape", "translation", "rotation")}
+    box = body.untapered()
+    return {name: getattr(box, name) for name in ("size", "shape", "translation", "rotation")} | {"taper": body.taper}
 
 
-def document(options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]]) -> str:
-    """The whole document."""
-    return json.dumps({**head(options), "frames": frames}, indent=1, allow_nan=False) + "\n"
+def scene_entry(track: Track) -> dict[str, Any]:
+    """The element of ``scene``: a body of the world of the camera poses."""
+    weak = undetermined(track.covariance, track.superquadric.size).any()
+    numbers = {**_parameters(track.superquadric), "sigma_size": track.sigma_size}
+    values = {name: value.tolist() for name, value in numbers.items()}
+    return {"id": track.id, "seen": track.seen, "status": "weak" if weak else "converged", **values}
+
+
+def document(
+    options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], scene: Sequence[Mapping[str, Any]] = ()
+) -> str:
+    """The whole document, with ``scene`` where there is one."""
+    whole = {**head(options), "frames": frames, **({"scene": scene} if scene else {})}
+    return json.dumps(whole, indent=1, allow_nan=False) + "\n"
 
 
 def table(frames: Sequence[Mapping[str, Any]]) -> str:
@@ -127,6 +141,7 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
         "shape": ["e1", "e2"],
         "translation": ["x", "y", "z"],
         "rotation": ["qx", "qy", "qz", "qw"],
+        "taper": ["kx", "ky"],
         "seen": [f"seen_a{k}" for k in axes],
     }
     single = ("score", "residual", "pixels", "label", "message")

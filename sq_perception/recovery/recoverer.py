@@ -2,6 +2,8 @@
 
     depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> score
 
+:class:`~sq_perception.recovery.still_scene.StillScene` puts the reuse of a frame's answers for the next one around it.
+
 With ``auto``, own segments are parted, joined, dropped where they show no object, and rid of strays by a network
 (:mod:`sq_perception.recovery.own_segments`).
 
@@ -23,9 +25,10 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, TypeVar
 
@@ -40,11 +43,11 @@ from sq_perception.imaging import perforation, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, GREATEST_MEDIAN, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.recovery import continuity, methods, prediction, seen_object, supports
+from sq_perception.recovery import methods, prediction, seen_object, supports
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
-from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference, timed
+from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -62,6 +65,49 @@ _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
 _SPARSE = 8
 """Every so many-th pixel tells what unit an image has."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """One image to recover from.
+
+    Attributes
+    ----------
+    depth : float32 (height, width)
+        Metres, NaN where nothing was measured; small holes of it are filled.
+    closed : bool (height, width) or None
+        The filled pixels: segments and views take them, fits do not.
+    labels : integer (height, width) or None
+        Masks from outside.
+    began
+        When work on it began, by :func:`time.perf_counter`.
+    """
+
+    depth: np.ndarray
+    closed: np.ndarray | None
+    camera: Camera
+    labels: np.ndarray | None
+    options: RecoveryOptions
+    began: float
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The objects of one image.
+
+    Attributes
+    ----------
+    segmentation
+        What they were found by.
+    depth : float32 (height, width)
+        The image without readings of objects that are out of range.
+    objects
+        The one with most pixels first.
+    """
+
+    segmentation: segments.Segmentation
+    depth: np.ndarray
+    objects: list[SeenObject]
 
 
 class Recoverer:
@@ -142,7 +188,7 @@ class Recoverer:
         rendered, index = raycast.render(body, camera)
         image = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
         self.recover(image, camera, (index >= 0).astype(np.int32))
-        self.recover(image, camera, previous=self.recover(image, camera))
+        self.recover(image, camera)
         image[::2] = np.nan
         perforation.filled(image)
 
@@ -152,7 +198,6 @@ class Recoverer:
         camera: Camera,
         labels: np.ndarray | None = None,
         options: RecoveryOptions | None = None,
-        previous: FrameRecovery | None = None,
     ) -> FrameRecovery:
         """Recover every object of a depth image.
 
@@ -165,118 +210,118 @@ class Recoverer:
             Instance masks, 0 for background; without them the image is segmented.
         options
             Defaults with the method given to the constructor.
-        previous
-            What the same camera's frame before this one came to, by the same network: bodies whose readings are the
-            same but for noise are taken from it (:mod:`sq_perception.recovery.continuity`).
 
         Raises
         ------
         ValueError
             For images that do not fit the camera or have the wrong type.  No depth *value* raises.
-        TypeError
-            For a previous frame that is none.
         CheckpointError
             If the method needs the network and it cannot be loaded.
         """
-        if not isinstance(previous, FrameRecovery | None):
-            raise TypeError(f"previous: expected a FrameRecovery, got {type(previous).__name__}")
+        readings = self.read(depth, camera, labels, options)
+        return self.recover_objects(readings, self.find_objects(readings))
+
+    def read(
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        labels: np.ndarray | None = None,
+        options: RecoveryOptions | None = None,
+    ) -> Readings:
+        """Check an image, parameters as in :meth:`recover`, and fill its small holes."""
+        began = time.perf_counter()
+        measured = _measured(camera.readings(depth), camera)
+        labels = None if labels is None else _masks(labels, measured)
+        measured, labels, closed = perforation.filled(measured, labels)
+        return Readings(measured, closed, camera, labels, options or self._options, began)
+
+    def find_objects(self, readings: Readings, segmentation: segments.Segmentation | None = None) -> Found:
+        """Segment an image; or take the segmentation of one that shows the same objects at the same pixels."""
+        with self._at_work():
+            found = self._segmented(readings) if segmentation is None else segmentation
+            depth = _in_range(readings.depth, found.labels, readings.options.depth_range)
+            return Found(found, depth, seen_object.objects(depth, found, readings.camera))
+
+    def recover_objects(
+        self, readings: Readings, found: Found, known: Mapping[int, Recovery] | None = None
+    ) -> FrameRecovery:
+        """Recover the objects of an image but those whose bodies are known, by label."""
+        known = known or {}
+        segmented = time.perf_counter()
+        camera, options, depth = readings.camera, readings.options, found.depth
+        with self._at_work():
+            network = self._network_for(readings)
+            config = None if network is None else network.config
+            strays = found.segmentation.strays
+            objects = found.objects if strays is None else [obj.without(strays) for obj in found.objects]
+
+            def prepared(obj: SeenObject) -> SeenObject:
+                plane = supports.support(obj, objects, depth, camera, found.segmentation, options)
+                obj = replace(obj, plane=plane)
+                if readings.labels is not None:
+                    obj = seen_object.completed(obj, depth, camera, found.segmentation.labels)
+                return seen_object.viewed(obj, depth, camera, config)
+
+            fresh = self._mapped(prepared, [obj for obj in objects if obj.label not in known])
+            if network is not None:
+                fresh = self._predicted(fresh, network, options)
+            predicted = time.perf_counter()
+
+            if readings.closed is not None:  # what stands in for readings is none to a fit
+                depth = np.where(readings.closed, np.float32(np.nan), depth)
+                fresh = [obj.of_readings(depth, readings.closed, found.segmentation.labels) for obj in fresh]
+            deadline = readings.began + options.time_budget
+            fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
+            fitted = time.perf_counter()
+
+            scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
+        segmentation = found.segmentation
+        likely = dict(zip(segmentation.ids, segmentation.objectness, strict=False))
+        recovered = {
+            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0))
+            for obj, fit, score in zip(fresh, fits, scores, strict=True)
+        }
+        bodies = tuple(known[obj.label] if obj.label in known else recovered[obj.label] for obj in found.objects)
+        scored = time.perf_counter()
+        milliseconds = {
+            "segmentation": 1e3 * (segmented - readings.began),
+            "network": 1e3 * (predicted - segmented),
+            "fit": 1e3 * (fitted - predicted),
+            "score": 1e3 * (scored - fitted),
+            "total": 1e3 * (scored - readings.began),
+        }
+        said = (
+            _without_support(segmentation, readings) if bodies else _why_empty(depth, segmentation, readings.labels),
+            _left_out(segmentation, options),
+            _wrong_unit(readings.depth, camera),
+        )
+        message = "; ".join(filter(None, said))
+        return FrameRecovery(bodies, milliseconds, segmentation.labels, segmentation.plane, message)
+
+    @contextmanager
+    def _at_work(self) -> Iterator[None]:
+        """Threads of this process, and a BLAS that starts none of its own."""
         if self._process != os.getpid():  # forked: threads stay behind, and who waits for them waits for ever
             self._begin()
         with one_blas_thread():
-            return self._recover(depth, camera, labels, options or self._options, previous)
+            yield
 
-    def _recover(
-        self,
-        depth: np.ndarray,
-        camera: Camera,
-        labels: np.ndarray | None,
-        options: RecoveryOptions,
-        previous: FrameRecovery | None,
-    ) -> FrameRecovery:
-        started = time.perf_counter()
-        milliseconds = dict.fromkeys(("segmentation", "network", "fit", "score", "total"), 0.0)
-        network = None
-        if options.method in NEEDS_NETWORK:
-            network = self._load_network(camera.is_pinhole and options.method == "auto")
-
-        with timed(milliseconds, "segmentation"):
-            measured = _measured(camera.readings(depth), camera)
-            labels = None if labels is None else _masks(labels, measured)
-            measured, labels, closed = perforation.filled(measured, labels)
-            kept = continuity.repeated(previous, measured, camera, options, labels)
-            if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
-                milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-                bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
-                return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=kept.reference)
-            if kept.reference:
-                found, age = kept.reference.segments, kept.reference.age
-            else:
-                found, age = self._segmented(measured, camera, labels, options, network), 0
-            depth = _in_range(measured, found.labels, options.depth_range)
-            objects = seen_object.objects(depth, found, camera)
-            same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
-
-        with timed(milliseconds, "network"):
-            config = None if network is None else network.config
-            cleaned = objects if found.strays is None else [obj.without(found.strays) for obj in objects]
-
-            def prepared(obj: SeenObject) -> SeenObject:
-                plane = supports.support(obj, cleaned, depth, camera, found, options)
-                obj = replace(obj, plane=plane)
-                if labels is not None:
-                    obj = seen_object.completed(obj, depth, camera, found.labels)
-                return seen_object.viewed(obj, depth, camera, config)
-
-            fresh = self._mapped(prepared, [obj for obj in cleaned if obj.label not in same])
-            if network is not None:
-                fresh = self._predicted(fresh, network, options)
-
-        with timed(milliseconds, "fit"):
-            deadline = started + options.time_budget
-            if closed is not None:  # what stands in for readings is none to a fit
-                depth = np.where(closed, np.float32(np.nan), depth)
-                fresh = [obj.of_readings(depth, closed, found.labels) for obj in fresh]
-            fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
-        with timed(milliseconds, "score"):
-            scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
-            of_label = dict(same)
-            likely = dict(zip(found.ids, found.objectness, strict=False))
-            for obj, fit, score in zip(fresh, fits, scores, strict=True):
-                of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0))
-            bodies = tuple(of_label[obj.label] for obj in objects)
-        readings, stride = continuity.sampled(measured, camera)
-        reference = Reference(readings, stride, camera, options, found, age=age, given=labels is not None)
-        if previous is not None and previous.reference is not None and same:
-            kept_labels = [body.label for body in bodies if body.repeats]
-            reference = continuity.mixed(reference, previous.reference, found.labels, kept_labels)
-        milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-        said = (
-            "" if bodies else _why_empty(depth, found, labels),
-            _without_support(found, camera, labels) if bodies else "",
-            _left_out(found, options),
-            _wrong_unit(measured, camera),
-        )
-        message = "; ".join(filter(None, said))
-        return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
-
-    def _segmented(
-        self,
-        depth: np.ndarray,
-        camera: Camera,
-        labels: np.ndarray | None,
-        options: RecoveryOptions,
-        network: Network | None,
-    ) -> segments.Segmentation:
+    def _segmented(self, readings: Readings) -> segments.Segmentation:
         """The objects of an image: the given masks, or its own segments, which the network of masks improves where
-        ``network`` predicts hulls."""
-        if labels is not None:
-            return segments.from_labels(labels, depth, camera, options)
-        found = segments.proposed(depth, camera, options.depth_range)
-        if options.repair and isinstance(network, inference.ThingPredictor):
-            found = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
-        else:
-            found = segments.judged(found)
-        return segments.limited(found, depth, camera, options)
+        the network predicts hulls."""
+        depth, camera, options = readings.depth, readings.camera, readings.options
+        if readings.labels is not None:
+            return segments.from_labels(readings.labels, depth, camera, options)
+        proposed = segments.proposed(depth, camera, options.depth_range)
+        if options.repair and isinstance(self._network_for(readings), inference.ThingPredictor):
+            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared)
+            return segments.limited(network.improved(proposed), depth, camera, options)
+        return segments.limited(segments.judged(proposed), depth, camera, options)
+
+    def _network_for(self, readings: Readings) -> Network | None:
+        if readings.options.method not in NEEDS_NETWORK:
+            return None
+        return self._load_network(readings.camera.is_pinhole and readings.options.method == "auto")
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; with ``auto``, bodies are predicted only once a fit asks for one."""
@@ -401,6 +446,6 @@ def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarr
     return "no support plane and no object found"
 
 
-def _without_support(found: segments.Segmentation, camera: Camera, labels: np.ndarray | None) -> str:
-    is_own = labels is None and camera.is_pinhole and found.plane is None
-    return "no support plane found" if is_own else ""
+def _without_support(found: segments.Segmentation, readings: Readings) -> str:
+    is_own = readings.labels is None and readings.camera.is_pinhole
+    return "no support plane found" if is_own and found.plane is None else ""

@@ -16,9 +16,6 @@ import numpy as np
 
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.segmentation.segments import Segmentation
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +36,7 @@ class Recovery:
         Probability that it is a thing (:mod:`sq_perception.segmentation.objectness`); 1 for masks from outside.
     repeats : int
         Frames before this one whose readings the body was recovered from, as these are the same but for noise
-        (:mod:`sq_perception.recovery.continuity`): an answer given before, with the same error.  0: from this frame.
+        (:mod:`sq_perception.recovery.still_scene`): an answer given before, with the same error.  0: from this frame.
     """
 
     fit: Fit
@@ -91,27 +88,6 @@ class Recovery:
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """What a frame's bodies were recovered from.
-
-    Attributes
-    ----------
-    depth : float32 (rows, columns)
-        Every ``stride``-th pixel of the image; 0 where nothing was measured.
-    segments
-        The objects, of all pixels, found ``age`` frames ago, or ``given``.
-    """
-
-    depth: np.ndarray
-    stride: int
-    camera: Camera
-    options: RecoveryOptions
-    segments: Segmentation
-    age: int
-    given: bool
-
-
-@dataclass(frozen=True, eq=False)
 class FrameRecovery:
     """All objects of one frame.
 
@@ -127,8 +103,6 @@ class FrameRecovery:
         Support plane, height above it = n.p + d.
     message
         Why there are no objects, that some were left out, or that the depths are hardly metres; empty otherwise.
-    reference
-        What the next frame of the same camera is compared with.
     """
 
     bodies: tuple[Recovery, ...]
@@ -136,7 +110,6 @@ class FrameRecovery:
     labels: np.ndarray
     plane: np.ndarray | None
     message: str
-    reference: Reference | None = None
 
     @property
     def recovered(self) -> tuple[Recovery, ...]:

@@ -246,9 +246,9 @@ def _recover(setup: Setup, work: Work) -> FrameRecovery:
 
 
 def _packed(found: FrameRecovery) -> FrameRecovery:
-    """A recovery as it is sent: labels in as few bytes as they need, and no reference, as no frame follows it."""
+    """A recovery as it is sent: labels in as few bytes as they need."""
     labels = found.labels.astype(np.min_scalar_type(found.labels.max(initial=0)))
-    return replace(found, labels=labels, reference=None)
+    return replace(found, labels=labels)
 
 
 def _unpacked(found: FrameRecovery | None) -> FrameRecovery | None:

@@ -29,6 +29,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.segmentation import pieces, segments
 from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
+from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 
 NO, YES, UNKNOWN = 0, 1, 2
@@ -126,7 +127,7 @@ def _measured(rng: np.random.Generator) -> _Measured:
     if rng.random() < _LARGER:
         true_depth = rng.uniform(*_TIMES) * true_depth
     if rng.random() < _ANY_SENSOR:
-        depth = thing_sensing.measured_by_any(true_depth, shown > 0, camera, rng)
+        depth = thing_sensing.measured_by_any(true_depth, shown > 0, camera, Stages(), rng)
     else:
         depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(true_depth, camera, rng)
     window = _cut(shown, rng)

@@ -3,7 +3,8 @@
 One of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline on either side,
 fattened or mixed or wandering edges, lost grazing sides.  Besides, in some images: waves, a side that is lost as one
 eye hardly sees it, lost edges, contours, dark blobs and bands, things that are lost but for patches, smoothing.  In
-half of them what is missing beside the thing is filled with what is there.
+half of them what is missing beside the thing is filled with what is there.  Last come the camera's
+:mod:`~sq_perception.simulation.camera_stages`.
 
 Depth in metres.
 """
@@ -16,6 +17,7 @@ import cv2
 import numpy as np
 
 from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 
 _SHINING = 0.08
@@ -48,15 +50,17 @@ def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
     return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 4)))
 
 
-def measured_by_any(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-    """What a random sensor reports of a true depth image."""
+def measured_by_any(
+    depth: np.ndarray, seen: np.ndarray, camera: Camera, stages: Stages, rng: np.random.Generator
+) -> np.ndarray:
+    """What a camera of a random sensor and these stages reports of a true depth image."""
     sensor = draw_sensor(camera, rng)
-    measured = sensor.measured(depth, camera, rng)
+    measured = stages.of_still([sensor.measured(depth, camera, rng) for _ in range(stages.frames)])
     if rng.random() < 0.4:
         measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:
         measured[seen & _turned_aside(depth, camera, rng)] = np.nan
-    if rng.random() < 0.35:
+    if rng.random() < 0.25:
         measured[_edges(depth, rng)] = np.nan
     if rng.random() < 0.1:
         measured[seen & _contours(depth, seen, rng)] = np.nan
@@ -69,7 +73,7 @@ def measured_by_any(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np
     if rng.random() < 0.5:
         filled = ~seen & np.isnan(measured) & np.isfinite(depth)
         measured[filled] = depth[filled]
-    return measured
+    return stages.processed(measured, seen, camera)
 
 
 def _waves(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

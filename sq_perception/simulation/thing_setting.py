@@ -9,7 +9,7 @@ around it   up to three neighbours on the table, the table's end, a wall or noth
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -74,6 +74,17 @@ class Setting:
     def under(self) -> np.ndarray | None:
         """What the thing stands on, as ``table``: that, or along it the top of something."""
         return None if self.table is None else self.table - np.array([0.0, 0.0, 0.0, self.height])
+
+    def seen_from(self, place: np.ndarray, camera: Camera) -> Setting:
+        """The same before a camera at ``place`` (3,), which looks the same way."""
+
+        def shifted(bodies: Superquadric) -> Superquadric:
+            return replace(bodies, translation=bodies.translation - place)
+
+        table = None if self.table is None else self.table + np.array([0.0, 0.0, 0.0, self.table[:3] @ place])
+        surface = None if self.surface is None else Mesh(self.surface.vertices - place, self.surface.faces)
+        parts, cavities, others = shifted(self.parts), shifted(self.cavities), shifted(self.others)
+        return Setting(parts, cavities, others, table, self.behind - place[2], camera, surface, self.height)
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth (height, width), +inf where there is nothing, and where the thing is seen."""

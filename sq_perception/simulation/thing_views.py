@@ -30,10 +30,11 @@ from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent, shown_step
+from sq_perception.simulation.camera_stages import Stages, aligned, decimated, decimated_camera, draw_stages
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.thing import Thing
 from sq_perception.simulation.thing_sensing import measured_by_any
-from sq_perception.simulation.thing_setting import draw_setting
+from sq_perception.simulation.thing_setting import Setting, draw_setting
 
 OWN = 0.5
 """Share of the views that show one's own things, where there are such."""
@@ -113,23 +114,20 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
     for _ in range(_ATTEMPTS):
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng)
         setting = draw_setting(thing, rng)
-        depth, seen = setting.render()
-        depth, seen = _something_before(depth, seen, rng)
-        if np.count_nonzero(seen) < _LEAST_SEEN:
-            continue
-        measured = measured_by_any(depth, seen, setting.camera, rng)
+        stages = draw_stages(rng)
+        measured, seen, camera = _measured(setting, stages, rng)
         plane = None
         below = setting.under if rng.random() < TOP_GIVEN else setting.table
         if below is not None and rng.random() < PLANE_GIVEN:
             plane = _imprecise(below, setting.parts.translation.mean(axis=0), rng)
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
-        mask = _masked(measured, seen, setting.camera, setting.table if plane is None else plane, rng)
+        mask = _masked(measured, seen, camera, setting.table if plane is None else plane, rng)
         if rng.random() < LOST:
             mask = _partly(mask, rng)
         if rng.random() >= UNREAD:
             mask = mask & np.isfinite(measured)
-        measured, mask, camera = _cut(measured, mask, setting.camera, rng)
+        measured, mask, camera = _cut(measured, mask, camera, rng)
         if np.count_nonzero(mask & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         view = canonical_view.from_mask(measured, mask, camera, _PIXELS, plane=plane, missing_is_hidden=True)
@@ -138,6 +136,30 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
             continue
         return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
+
+
+def _measured(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """The image that a camera of these stages makes, where the thing is seen, and the camera."""
+    camera = setting.camera
+    depth, seen = setting.render()
+    if stages.beside:
+        # The sensor is beside the camera that the image is aligned to, and sees the thing at the same place.
+        place = np.array([stages.beside, 0.0, 0.0])
+        size = round(camera.width * stages.focal), round(camera.height * stages.focal)
+        middle = setting.parts.translation[:, 2].mean()
+        cx = stages.focal * (camera.cx + camera.fx * stages.beside / middle)
+        sensor = Camera(*size, stages.focal * camera.fx, stages.focal * camera.fy, cx, stages.focal * camera.cy)
+        near, whose = setting.seen_from(place, sensor).render()
+        measured = measured_by_any(near, whose, sensor, stages, rng) if whose.any() else near
+        return aligned(measured, sensor, place, camera, stages.whole), seen, camera
+    depth, seen = _something_before(depth, seen, rng)
+    if stages.decimation > 1:
+        half = slice(stages.decimation // 2, None, stages.decimation)
+        kept = decimated_camera(camera, stages.decimation)
+        shown = np.s_[: kept.height, : kept.width]
+        measured = measured_by_any(depth, seen, camera, stages, rng) if seen.any() else depth
+        return decimated(measured, stages.decimation), seen[half, half][shown], kept
+    return measured_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
 
 
 def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

@@ -1,25 +1,19 @@
 """Which observation continues which track.
 
-A pair is possible in place if the bodies overlap: with h the support functions along the line of the centres, whose
+A pair passes the gate in place if the bodies overlap: with the support functions h along the line of the centres, whose
 distance is D,
 
     D / (h_track + h_observed) < 1/2,    or < 1 while the centres agree within their covariances.
 
-Its cost is the negative logarithm of a Student density of the whole difference, in the observation's best form
-(:mod:`sq_perception.tracking.forms`): with Mahalanobis distance d in n = 11 dimensions
+Its cost is the negative logarithm of a Student density with n degrees of freedom of the difference in n dimensions,
 
-    cost = (n + nu) log(1 + d^2 / nu) + log det S,
+    cost = 2 n log(1 + d^2 / n) + log det S,
 
-which ranks like a normal density close by and stays moderate for bodies that moved.  The assignment of least cost wins,
-where what is left alone costs as much as a pair at d = 100: a pair close by is not given up for two far apart.
+like that of a normal density close by, and moderate for bodies that moved.  The assignment of least cost is taken;
+what is left alone costs as much as a pair at d = 100: a pair close by is not given up for two far apart.
 
-Two bodies cannot be in one place.  A track that overlaps an older one so deeply is its twin: most likely a piece that
-a segmentation once cut off.  Of several observations in the place of a track the first is for the elder, the rest for
-its twins: other pairs cost more.  Bodies of quite other sizes, such as an apple in a bowl, outweigh that.
-
-What is left over may have been moved by more than its own size.  A body whose sizes and exponents alone agree, within
-the distance that something can travel in the time, is taken for the same: these five errors are compared in the form
-whose sizes fit best, whatever the rotation.
+What is left over may have been moved by more than its own size.  It is the same body if its sizes and exponents agree
+within the distance that something can be carried in the time.
 """
 
 from __future__ import annotations
@@ -30,17 +24,13 @@ from typing import NamedTuple
 import numpy as np
 
 from sq_perception.geometry.kernels import inline_kernel, kernel, support
-from sq_perception.tracking import agreement, forms, state
+from sq_perception.tracking import forms, gating, state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 
-_DEEP = 0.5
-"""D over both supports, where 1 is touching: no two things can be nearer than half of that.  Chosen."""
-_FREEDOM = 5.0
-"""nu of the Student density: long tails, as deviations are often too small.  Chosen."""
+DEEP = 0.5
+"""D over both supports, 1 where bodies touch, below which they are in one place: no two things are.  Chosen."""
 _ALONE = 1e4
-"""d^2 of a pair, of the median of covariances, that costs as much as what is left alone: beyond any error.  Chosen."""
-_TWIN = 30.0
-"""What another pair than elder and first costs more: as much as d = 5.  Chosen."""
+"""d^2, with the median covariance, that costs as much as what is left alone.  Chosen: beyond any error."""
 
 
 class Pairs(NamedTuple):
@@ -63,68 +53,51 @@ class Pairs(NamedTuple):
         return Pairs(*(np.concatenate(both) for both in zip(self, other, strict=True)))
 
 
-def in_place(
-    track: np.ndarray,
-    track_covariance: np.ndarray,
-    observed: np.ndarray,
-    covariance: np.ndarray,
+def pairs_in_place(
+    track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> Pairs:
-    """Pairs of n tracks (n, 12), oldest first, and m observations (m, 12), most important first, that overlap.
+    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap.
 
-    Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to theirs, such as a least error,
-    is part of the tracks'.
+    Covariances are (n, 11, 11) and (m, 11, 11); an error that observations have beside theirs is part of the tracks'.
     """
-    apart = _apart(track, observed)
+    distance = separation(track, observed)
     between = observed[None, :, 5:8] - track[:, None, 5:8]
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
-    agree = state.mahalanobis(centres, between) < agreement.LIMITS[3]
-    deep = apart < _DEEP
-    i, j = np.nonzero(deep | ((apart < 1) & agree))
+    agree = state.mahalanobis(centres, between) < gating.LIMITS[3]
+    i, j = np.nonzero((distance < DEEP) | ((distance < 1) & agree))
     if not len(i):
         return Pairs.none()
-    pairs = Pairs(i, j, *forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], forms.EXCHANGE))
+    pairs = Pairs(i, j, *forms.nearest(track[i], track_covariance[i], observed[j], covariance[j]))
     total = track_covariance[i] + pairs.covariance
-    error = state.difference(track[i], pairs.state)
-    younger, later = np.any(twins(track), axis=1), np.greater(np.cumsum(deep, axis=1), deep)
-    unlike = younger[i] != later[i, j]
-    return _assigned(pairs, total, error, _TWIN * unlike, deep.shape)
+    return _assign(pairs, total, state.difference(track[i], pairs.state), np.zeros(len(i)), distance.shape)
 
 
-def twins(states: np.ndarray) -> np.ndarray:
-    """Whether state i is a twin of an older state j, bool (n, n), of states (n, 12), the oldest first."""
-    return np.tril(_apart(states, states) < _DEEP, -1)
-
-
-def elsewhere(
-    track: np.ndarray,
-    track_covariance: np.ndarray,
-    reach: np.ndarray,
-    observed: np.ndarray,
-    covariance: np.ndarray,
+def pairs_elsewhere(
+    track: np.ndarray, track_covariance: np.ndarray, reach: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> Pairs:
-    """Pairs that agree in sizes and exponents, with centres within ``reach`` (n,) metres."""
+    """Pairs that agree in sizes and exponents, with centres within ``reach`` (n,) metres; the near ones first."""
     distance = np.linalg.norm(observed[None, :, 5:8] - track[:, None, 5:8], axis=-1)
     i, j = np.nonzero(distance < reach[:, None])
     if not len(i):
         return Pairs.none()
-    free = _unplaced(track_covariance[i], distance[i, j])
-    pairs = Pairs(i, j, *forms.nearest(track[i], free, observed[j], covariance[j], forms.EXCHANGE))
+    free = forms.loosen_pose(track_covariance[i], distance[i, j])
+    pairs = Pairs(i, j, *forms.nearest(track[i], free, observed[j], covariance[j]))
     total = (track_covariance[i] + pairs.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
     error = state.difference(track[i], pairs.state)[:, SIZE_AND_SHAPE]
-    alike = state.mahalanobis(total, error) < agreement.LIMITS[5]
+    alike = state.mahalanobis(total, error) < gating.LIMITS[5]
     way = distance[i, j] / reach[i]
-    return _assigned(pairs.at(alike), total[alike], error[alike], way[alike], distance.shape)
+    return _assign(pairs.at(alike), total[alike], error[alike], way[alike], distance.shape)
 
 
 def warm_up() -> None:
     """Compile, or load from disk, every kernel."""
-    _apart(np.ones((1, 12)), np.ones((1, 12)))
+    separation(np.ones((1, 12)), np.ones((1, 12)))
     cheapest(np.ones((1, 1)))
 
 
 @kernel
-def _apart(some: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Distances (n, m) of the centres of states (n, 12) and (m, 12) over both supports along the way."""
+def separation(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Distances (n, m) of the centres of states (n, 12) and (m, 12) over both supports along their line."""
     found = np.empty((len(some), len(others)))
     for i in range(len(some)):
         for j in range(len(others)):
@@ -138,82 +111,62 @@ def _apart(some: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 @inline_kernel
 def _extent(state: np.ndarray, x: float, y: float, z: float) -> float:
-    """The support of a state (12,) in a direction: half of what it measures along it."""
+    """The support of a state (12,) in a unit direction."""
     a, b, c, w = state[8], state[9], state[10], state[11]
     # R^T n = n + 2 v x (v x n - w n) for the quaternion (v, w).
     dx, dy, dz = b * z - c * y - w * x, c * x - a * z - w * y, a * y - b * x - w * z
-    return float(
-        support(
-            x + 2.0 * (b * dz - c * dy),
-            y + 2.0 * (c * dx - a * dz),
-            z + 2.0 * (a * dy - b * dx),
-            state[0],
-            state[1],
-            state[2],
-            state[3],
-            state[4],
-        )
-    )
+    x, y, z = x + 2.0 * (b * dz - c * dy), y + 2.0 * (c * dx - a * dz), z + 2.0 * (a * dy - b * dx)
+    form = state[0], state[1], state[2], state[3], state[4], 0.0, 0.0
+    return float(support(x, y, z, *form))
 
 
-def _unplaced(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Covariances (k, 11, 11) that know sizes and exponents only."""
-    free = covariance.copy()
-    free[:, range(5, 8), range(5, 8)] += 1 + distance[:, None] ** 2
-    free[:, range(8, 11), range(8, 11)] += 10.0
-    return free
-
-
-def _assigned(
-    pairs: Pairs, covariance: np.ndarray, error: np.ndarray, more: np.ndarray, shape: tuple[int, ...]
+def _assign(
+    pairs: Pairs, covariance: np.ndarray, error: np.ndarray, extra: np.ndarray, shape: tuple[int, ...]
 ) -> Pairs:
-    """The pairs (k,) of the assignment that costs least, with errors (k, n) and what each costs more."""
+    """The pairs (k,) of the assignment of least cost, with errors (k, n) and what each costs beside them."""
     if not len(pairs.track):
         return pairs
-    dimensions, volume = error.shape[-1] + _FREEDOM, np.linalg.slogdet(covariance)[1]
-    cost = dimensions * np.log1p(state.mahalanobis(covariance, error) / _FREEDOM) + volume
-    table = np.full(shape, dimensions * np.log1p(_ALONE / _FREEDOM) + np.median(volume))
-    table[pairs.track, pairs.observed] = cost + more
-    kept = cheapest(table) if len(table) <= len(table.T) else cheapest(table.T.copy()).T
-    return pairs.at(kept[pairs.track, pairs.observed])
+    n, volume = error.shape[-1], np.linalg.slogdet(covariance)[1]
+    table = np.full(shape, 2 * n * np.log1p(_ALONE / n) + np.median(volume))
+    table[pairs.track, pairs.observed] = 2 * n * np.log1p(state.mahalanobis(covariance, error) / n) + volume + extra
+    chosen = cheapest(table) if len(table) <= len(table.T) else cheapest(table.T.copy()).T
+    return pairs.at(chosen[pairs.track, pairs.observed])
 
 
 @kernel
 def cheapest(cost: np.ndarray) -> np.ndarray:
     """The pairs of rows and columns with the least sum of costs (n, m), n <= m, each row in one: (n, m), bool.
 
-    Rows are added one by one, each by the shortest path that changes earlier pairs, in costs less the prices of rows
-    and columns (Crouse, On implementing 2D rectangular assignment algorithms, 2016).
+    The Hungarian method with potentials: row after row takes the end of its shortest alternating path to a free column
+    (Kuhn 1955, Jonker and Volgenant 1987).  Row 0 and column 0 stand for none.
     """
     rows, columns = cost.shape
-    of_row, of_column = np.full(rows, -1), np.full(columns, -1)
-    of_rows, of_columns = np.zeros(rows), np.zeros(columns)  # prices
-    for new in range(rows):
-        length, before = np.full(columns, np.inf), np.full(columns, -1)
-        done = np.zeros(columns, dtype=np.bool_)
-        row, end, so_far = new, -1, 0.0
-        while row >= 0:
-            end = -1
-            for j in range(columns):
-                if not done[j]:
-                    through = so_far + cost[row, j] - of_rows[row] - of_columns[j]
-                    if through < length[j]:
-                        length[j], before[j] = through, row
-                    if end < 0 or length[j] < length[end]:
-                        end = j
+    of_rows, of_columns = np.zeros(rows + 1), np.zeros(columns + 1)  # potentials
+    row_of = np.zeros(columns + 1, dtype=np.int64)
+    for new in range(1, rows + 1):
+        length, before = np.full(columns + 1, np.inf), np.zeros(columns + 1, dtype=np.int64)
+        done = np.zeros(columns + 1, dtype=np.bool_)
+        row_of[0], end = new, 0
+        while row_of[end] > 0:
             done[end] = True
-            row, so_far = of_column[end], length[end]
-        of_rows[new] += so_far
-        for j in range(columns):
-            if done[j]:
-                of_columns[j] -= so_far - length[j]
-                if j != end:
-                    of_rows[of_column[j]] += so_far - length[j]
-        while end >= 0:  # the row before takes the end, and its own column is the next end; the new one had none
-            row = before[end]
-            of_column[end] = row
-            of_row[row], end = end, of_row[row]
+            row, start, end, step = row_of[end], end, 0, np.inf
+            for j in range(1, columns + 1):
+                if not done[j]:
+                    reduced = cost[row - 1, j - 1] - of_rows[row] - of_columns[j]
+                    if reduced < length[j]:
+                        length[j], before[j] = reduced, start
+                    if length[j] < step:
+                        step, end = length[j], j
+            for j in range(columns + 1):
+                if done[j]:
+                    of_rows[row_of[j]] += step
+                    of_columns[j] -= step
+                else:
+                    length[j] -= step
+        while end > 0:
+            row_of[end], end = row_of[before[end]], before[end]
     pairs = np.zeros((rows, columns), dtype=np.bool_)
-    for i in range(rows):
-        pairs[i, of_row[i]] = True
+    for j in range(1, columns + 1):
+        if row_of[j] > 0:
+            pairs[row_of[j] - 1, j - 1] = True
     return pairs

@@ -1,164 +1,164 @@
-"""Fusing what was observed of one body, without counting the same error twice.
+"""Fusing observations of one body without counting an error twice that they share.
 
-Equations
----------
 An observation z of the state x with covariance R, seen from the direction c in the body's frame, has three errors,
 
     z = x + g + b_c + v,    cov g = gamma R,    cov b_c = B = rho R + F,    cov v = W = (1 - rho - gamma) R.
 
-v is new in every frame.  b_c is common to all views from within an angle of c: it is what a still camera sees wrongly
-again and again, an outline, a wrong hidden side, an object that is no superquadric, a camera that is not quite
-calibrated.  F is its least size.  b_c is considered and not estimated (Schmidt 1966): along with the covariance P of
-the error x^ - x of the estimate its correlation C_c = cov(x^ - x, b_c) with each view is kept, and
+v is new in every frame.  b_c is common to all views from within VIEW_ANGLE of c: what a still camera sees wrongly every
+time, such as an outline, a wrong hidden side, or a thing that is no superquadric; F is its least.  It is considered
+and not estimated (Schmidt 1966): with the covariance P of x^ - x its correlation C_c = cov(x^ - x, b_c) with each view
+is kept, and
 
     S = P - C_c - C_c^T + B + W,    K = (P - C_c) S^-1,    x^ <- x^ + K (z - x^),
     P <- (I-K) P (I-K)^T + (I-K) C_c K^T + K C_c^T (I-K)^T + K (B + W) K^T,
     C_j <- (I-K) C_j + K B [j = c].
 
-g is common to all views from anywhere, such as edges that a sensor widens or what a network takes the unseen side for,
-and no number of views lessens it.  It is g = L q with L L^T = gamma R and one unknown q of unit covariance for the life
-of the track.  Its effect on x^ is carried along,
+g is common to all views from anywhere: edges that a sensor widens, what a network takes the unseen side for.  With
+L L^T = gamma R its effect is carried along,
 
-    M <- (I-K) M + K L,    cov(x^ - x) = P + M M^T,
+    M <- (I-K) M + K L,    cov(x^ - x) = P + M M^T.
 
-and K does not know of it: a gain that did would subtract one view from another to cancel what they are supposed to
-share.
+K does not know of g: a gain that did would subtract views from each other to cancel what they share.
 
-An answer that repeats an earlier one, of readings that are the same but for noise, has the same v again and shows no
-more than that the body is where it was: it is not fused, K = 0.
-
-Equal views are averaged with equal weights and P falls to B, not to zero; views from elsewhere count as new.  With rho
-= gamma = 0 and F = 0 it is the Kalman filter of a constant.
-
-A view beyond the kept number takes the place of the one used longest ago: P keeps its error, only that a later look
-from there counts as new.  So does, in those numbers, a look that knows some of them far better than the view's common
-error: a hand was in front, say, and is no more.  The three of the centre count as one, as their axes are the world's.
+Equal views are averaged, and P falls to B, not to zero; views from elsewhere count as new.  With rho = gamma = 0 and
+F = 0 it is the Kalman filter of a constant.  A view beyond the number that is kept replaces the one used longest ago.
+Where a look knows some numbers far better than its view's B, as after a hand was in front, it replaces them there.  The
+three of the centre count as one, as their axes are the world's.
 
 Reference: S. F. Schmidt, Application of State-Space Methods to Navigation Problems, Adv. in Control Systems 3, 1966.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.tracking import state
+from sq_perception.tracking import state as states
 from sq_perception.tracking.state import CENTRE, LENGTH, TURN
 
 VIEW_ANGLE = 0.25
-"""Radians: views closer than this share their systematic error.  Chosen: outlines change little within 14 degrees."""
+"""Radians: views closer than this share b_c.  Chosen: outlines change little within 14 degrees."""
 VIEWS = 16
-"""Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
+"""Directions that are kept for each body: two thirds of a circle at VIEW_ANGLE."""
 _BETTER = 4.0
-"""Ratio of variances: a look is far better that halves a deviation.  Chosen: of 224 looks at eight simulated bodies
+"""Ratio of variances: a look that halves a deviation is far better.  Chosen: of 224 looks at eight simulated bodies
 that nothing hid, the least sure first look had 2.1 times a later one's."""
 
 
-class Views(NamedTuple):
-    """The directions that bodies were seen from; batch dimensions first, then one entry per kept view.
+class Estimate(NamedTuple):
+    """What is known of a body; batch dimensions first.
 
     Attributes
     ----------
-    direction : (..., m, 3)
-        Unit vector from the body to the camera, body frame; zero for an entry not used yet.
-    bias : (..., m, 11, 11)
-        B of each view.
-    correlation : (..., m, 11, 11)
-        C of each view.
-    used : (..., m)
-        Number of the observation that used it last; -1 never.
+    state : (..., 12)
+    covariance, lasting : (..., 11, 11)
+        P and M.
+    directions : (..., VIEWS, 3)
+        Unit vectors from the body to the camera of each view, body frame; zero for an entry not used yet.
+    biases, correlations : (..., VIEWS, 11, 11)
+        B and C of each view.
+    used : (..., VIEWS)
+        Number of the observation that used it last; -1: none.
     """
 
-    direction: np.ndarray
-    bias: np.ndarray
-    correlation: np.ndarray
+    state: np.ndarray
+    covariance: np.ndarray
+    lasting: np.ndarray
+    directions: np.ndarray
+    biases: np.ndarray
+    correlations: np.ndarray
     used: np.ndarray
 
     @classmethod
-    def first(cls, direction: np.ndarray, bias: np.ndarray) -> Views:
-        """One view, whose common error is that of the estimate."""
+    def first(cls, observation: Observation) -> Estimate:
+        """What a single observation (unbatched) tells."""
+        white, common, shared = observation.white, observation.common, observation.shared
         directions, biases, used = np.zeros((VIEWS, 3)), np.zeros((VIEWS, LENGTH, LENGTH)), np.full(VIEWS, -1)
-        directions[0], biases[0], used[0] = direction, bias, 0
-        return cls(directions, biases, biases, used)
+        directions[0] = quaternions.to_matrix(observation.state[8:12]).T @ observation.direction
+        biases[0], used[0] = common, 0
+        return cls(observation.state, white + common, root(shared), directions, biases, biases, used)
 
-    def of(self, index: int) -> Views:
-        return Views(*(part[index] for part in self))
+    @classmethod
+    def stack(cls, some: Iterable[Estimate]) -> Estimate:
+        return cls(*(np.stack(parts) for parts in zip(*some, strict=True)))
+
+    def at(self, index: int) -> Estimate:
+        return Estimate(*(part[index] for part in self))
+
+    @property
+    def total(self) -> np.ndarray:
+        """The covariance (..., 11, 11) of the whole error."""
+        return self.covariance + self.lasting @ self.lasting.swapaxes(-1, -2)
 
 
-def fused(
-    track: np.ndarray,
-    covariance: np.ndarray,
-    lasting: np.ndarray,
-    views: Sequence[Views],
-    observed: np.ndarray,
-    white: np.ndarray,
-    common: np.ndarray,
-    shared: np.ndarray,
-    direction: np.ndarray,
-    turning: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, Views]:
+class Observation(NamedTuple):
+    """n observations in the forms of their tracks, world frame.
+
+    ``white``, ``common`` and ``shared`` (n, 11, 11) are the covariances W, B and gamma R, ``direction`` (n, 3) leads
+    from the body to the camera.
+    """
+
+    state: np.ndarray
+    white: np.ndarray
+    common: np.ndarray
+    shared: np.ndarray
+    direction: np.ndarray
+
+
+def update(track: Estimate, seen: Observation, turning: np.ndarray) -> Estimate:
     """n tracks after one observation each.
 
-    Parameters
-    ----------
-    track, observed : (n, 12)
-        States in the world frame, in the same form.
-    covariance : (n, 11, 11)
-        P.
-    lasting : (n, 11, 11)
-        M.
-    views
-        Of each track; those after the observation are returned as a batch (n,).
-    white, common : (n, 11, 11)
-        W, and B for a view from a new direction.
-    shared : (n, 11, 11)
-        L.
-    direction : (n, 3)
-        Unit vector from the body to the camera, world frame.
-    turning : (n,) bool
-        Bodies that have turned themselves.  What rotates a resting body's estimate is a correction, and what it was
-        seen from stays where it is in the world; a turned body shows another side.
+    ``turning`` (n,) are bodies that have rotated themselves.  What rotates the estimate of a resting body is a
+    correction: it was seen from the same directions of the world.  A body that rotated shows another side.
     """
-    count = len(track)
-    error = state.difference(track, observed)
-    has_turned = turning[:, None] & (np.einsum("nii->ni", white + common)[:, TURN] < state.DETERMINED**2)
+    row = np.arange(len(track.state))
+    error = states.difference(track.state, seen.state)
+    has_turned = turning[:, None] & (_variances(seen.white + seen.common)[:, TURN] < states.DETERMINED**2)
     turn = quaternions.from_rotation_vector(np.where(has_turned, error[:, TURN], 0.0))
-    seen_as = quaternions.multiply(track[:, 8:12], turn)
-    local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
+    seen_as = quaternions.multiply(track.state[:, 8:12], turn)
+    local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), seen.direction)
 
-    row = np.arange(count)
-    directions, biases, correlations, used = (np.stack(parts) for parts in zip(*views, strict=True))
+    directions, used = track.directions.copy(), track.used.copy()
+    biases, correlations = track.biases.copy(), track.correlations.copy()
     likeness = np.einsum("nmi,ni->nm", directions, local)
     place = np.argmax(likeness, axis=1)
-    fresh = likeness[row, place] < np.cos(VIEW_ANGLE)
-    place = np.where(fresh, np.argmin(used, axis=1), place)
-    directions[row[fresh], place[fresh]] = local[fresh]
+    is_new = likeness[row, place] < np.cos(VIEW_ANGLE)
+    place = np.where(is_new, np.argmin(used, axis=1), place)
+    directions[row[is_new], place[is_new]] = local[is_new]
     used[row, place] = used.max(axis=1) + 1
 
     bias, correlation = biases[row, place], correlations[row, place]
-    better = fresh[:, None] | (_variances(bias) > _BETTER * _variances(common))
-    same = ~better[:, :, None] & ~better[:, None, :]
-    bias = np.where(same, bias, np.where(better[:, :, None] & better[:, None, :], common, 0.0))
+    better = is_new[:, None] | (_variances(bias) > _BETTER * _variances(seen.common))
+    both, neither = better[:, :, None] & better[:, None, :], ~better[:, :, None] & ~better[:, None, :]
+    bias = np.where(neither, bias, np.where(both, seen.common, 0.0))
     correlation = np.where(better[:, None, :], 0.0, correlation)
     biases[row, place], correlations[row, place] = bias, correlation
-    noise = bias + white
-    total = covariance - correlation - correlation.swapaxes(1, 2) + noise
-    gain = np.linalg.solve(total, (covariance - correlation).swapaxes(1, 2)).swapaxes(1, 2)
-    step = np.einsum("nij,nj->ni", gain, error)
 
+    noise = bias + seen.white
+    crossed = track.covariance - correlation
+    total = crossed - correlation.swapaxes(1, 2) + noise
+    gain = np.linalg.solve(total, crossed.swapaxes(1, 2)).swapaxes(1, 2)
     kept = np.eye(LENGTH) - gain
     cross = kept @ correlation @ gain.swapaxes(1, 2)
-    after = kept @ covariance @ kept.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+    covariance = kept @ track.covariance @ kept.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+    covariance = covariance + cross + cross.swapaxes(1, 2)
     correlations = kept[:, None] @ correlations
     correlations[row, place] += gain @ bias
 
+    step = np.einsum("nij,nj->ni", gain, error)
     back = quaternions.to_matrix(quaternions.from_rotation_vector(np.where(has_turned, 0.0, step[:, TURN])))
-    after = 0.5 * (after + after.swapaxes(1, 2))
-    seen = Views(directions @ back, biases, correlations, used)
-    return state.moved(track, step), after, kept @ lasting + gain @ shared, seen
+    return Estimate(
+        states.add(track.state, step),
+        0.5 * (covariance + covariance.swapaxes(1, 2)),
+        kept @ track.lasting + gain @ root(seen.shared),
+        directions @ back,
+        biases,
+        correlations,
+        used,
+    )
 
 
 def _variances(covariance: np.ndarray) -> np.ndarray:
@@ -169,6 +169,6 @@ def _variances(covariance: np.ndarray) -> np.ndarray:
 
 
 def root(covariance: np.ndarray) -> np.ndarray:
-    """The symmetric roots of covariances (..., 11, 11): they turn with the world, which Cholesky's do not."""
+    """The symmetric roots of covariances (..., 11, 11): they rotate with the world, which Cholesky's do not."""
     values, vectors = np.linalg.eigh(covariance)
     return (vectors * np.sqrt(np.maximum(values, 0))[..., None, :]) @ vectors.swapaxes(-1, -2)

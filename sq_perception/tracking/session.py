@@ -1,18 +1,17 @@
-"""A tracker at work on a stream of frames: for every recovered body its id, and the numbers to publish.
+"""A tracker at work on a stream of frames: an id for every recovered body, and the numbers to publish.
 
-What a consumer gets of each body is in the optical frame of its frame and in the form that continues its track:
+A consumer gets each body in the optical frame of its frame and in the form that continues its track:
 
 | the frame's camera pose | the observation | numbers |
 | --- | --- | --- |
-| known, or the camera stands still | lies where its track is | those of the track: fused over all frames |
-| known, or the camera stands still | has left its track, and the track has not followed | its own |
+| known, or the camera stands still | agrees with its track | those of the track: fused over all frames |
+| known, or the camera stands still | is elsewhere, and the track has not followed | its own |
 | known, or the camera stands still | spans more than the track's body can show | its own |
 | wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
 
-So a body that is moved by a hand is published no farther from where the frame shows it than four deviations of that
-one observation, and nothing is published that the frame does not show.  A single observation of other sizes in the same
-place is taken for an error and left out.  Observations keep their bodies, and have their axes named as the track's;
-where the fit has taken another axis as z, that changes the exponents (:func:`sq_perception.tracking.forms.named`).
+So a body that a hand moves is published no farther from where the frame shows it than four deviations of that one
+observation, and nothing is published that the frame does not show.  A single observation of other sizes in the same
+place is taken for an error and left out.
 
 Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
 FIRST_FAILED_ID + its label, which no track reaches.
@@ -33,13 +32,13 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.tracking import forms, state
 from sq_perception.tracking.state import LENGTH, Observed
-from sq_perception.tracking.tracker import Tracker
+from sq_perception.tracking.tracker import Track, Tracker
 
 FIRST_FAILED_ID = 2**31
 _SPANNED = 1.2
-"""Of a body's width: measured points that span more are of a larger one, such as was put in the place of a smaller one
-while nobody looked, however unsure its own size is.  Of things of benchmarks/household_things that stay, one in a
-hundred spans 1.03 of its track's body and more; what took another one's place, and kept its id, up to 2.7.  Chosen."""
+"""Measured points that span more than this share of a body's width are of a larger one, put in its place while nobody
+looked.  Of household things that stay, one in a hundred spans 1.03 of its track's body and more; of what took another
+one's place, and kept its id, up to 2.7.  Chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,25 +94,30 @@ class Tally:
 
 
 class TrackingSession:
-    """Follows the bodies of one camera's frames."""
+    """Follows the bodies of one camera's frames, or of several cameras with known poses."""
 
     def __init__(self) -> None:
         self._tracker = Tracker()
         self._without_pose: Tracker | None = None
         """What follows frames without a pose, by the last one known: a copy, as where their bodies are is a guess."""
         self._stamp = -np.inf
-        self._pose: tuple[np.ndarray, np.ndarray] = state.as_pose(None)
+        self._pose = state.parse_pose(None)
         self.tally = Tally()
         """Counts after the last frame; may be read from another thread."""
-        self.hidden: tuple[int, ...] = ()
+        self.tracks: tuple[Track, ...] = ()
+        """All tracks after the last frame, in the world."""
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
         """Ids of the tracks that the last frame did not show and that are not given up."""
+        return tuple(track.id for track in self.tracks if track.observation is None)
 
     def reset(self) -> None:
         """Forget every body; ids go on."""
         self._posed().reset()
-        self._stamp, self._pose = -np.inf, state.as_pose(None)
+        self._stamp, self._pose = -np.inf, state.parse_pose(None)
         self.tally = replace(self.tally, tracks=0)
-        self.hidden = ()
+        self.tracks = ()
 
     def follow(
         self,
@@ -145,48 +149,50 @@ class TrackingSession:
         ValueError
             As :meth:`Tracker.update`; nothing has changed then, unless the stamp is before the last one.
         """
-        rotation, position = state.as_pose(camera_pose) if is_pose_known else self._pose
-        if stamp < self._stamp:
+        rotation, position = state.parse_pose(camera_pose) if is_pose_known else self._pose
+        is_back = stamp < self._stamp
+        if is_back:
             self._posed().reset()  # its own last frame, one with a pose, may be older
         if not is_pose_known and self._without_pose is None:
             self._without_pose = copy(self._tracker)
         tracker = self._posed() if is_pose_known else self._without_pose or self._tracker
         tracks = tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
-        self.tally = Tally(
-            tracks=len(tracks),
-            births=tracker.births,
-            resets=self.tally.resets + (stamp < self._stamp),
-            without_pose=self.tally.without_pose + (not is_pose_known),
-        )
-        self._stamp, self._pose = stamp, (rotation, position)
-        self.hidden = tuple(track.id for track in tracks if track.observation is None)
+        resets, without_pose = self.tally.resets + is_back, self.tally.without_pose + (not is_pose_known)
+        self.tally = Tally(len(tracks), tracker.births, resets, without_pose)
+        self._stamp, self._pose, self.tracks = stamp, (rotation, position), tracks
 
-        is_world = not position.any() and not rotation[:3].any()
         back = quaternions.conjugate(rotation)
         matrix = quaternions.to_matrix(back)
-        by_index = {track.observation: track for track in tracks if track.observation is not None}
-        bodies = [by_index[index].superquadric for index in range(len(observed))]
-        if not is_world:
-            bodies = [body.transformed(back, -matrix @ position) for body in bodies]
+        by_index = {track.observation: track for track in tracks}
+        here = [by_index[index] for index in range(len(observed))]
+        bodies = [track.superquadric.transformed(back, -matrix @ position) for track in here]
         outgrown = _outgrown(bodies, observed)
         found = []
-        for index, (body, observation) in enumerate(zip(bodies, observed, strict=True)):
-            track = by_index[index]
-            covariance = track.covariance if is_world else state.turned(track.covariance, matrix)
-            is_fused = is_pose_known and track.follows and not outgrown[index]
+        for track, body, observation, is_outgrown in zip(here, bodies, observed, outgrown, strict=True):
+            covariance = state.rotate(track.covariance, matrix)
+            is_fused = is_pose_known and track.follows and not is_outgrown
             if not is_fused:
                 body, covariance = _in_form_of(body, covariance, observation)
             elif not np.isfinite(observation.covariance).all():
                 covariance = np.full((LENGTH, LENGTH), np.nan)
+            body = _tapered_like(body, observation.superquadric)
             found.append(Followed(track.id, track.seen, is_fused, body, covariance))
         return tuple(found)
 
     def _posed(self) -> Tracker:
         """The tracker of frames with a pose, as it was before those without one, but for what these counted."""
         if self._without_pose is not None:
-            self._tracker.count_on(self._without_pose)
+            self._tracker.take_counts(self._without_pose)
             self._without_pose = None
         return self._tracker
+
+
+def _tapered_like(body: Superquadric, observed: Superquadric) -> Superquadric:
+    """An untapered body in the box of the observed one, with its taper where both have the same z axis."""
+    turn = np.round(body.rotation_matrix.T @ observed.rotation_matrix)
+    if not observed.is_tapered or abs(turn[2, 2]) != 1:
+        return body
+    return body.with_taper(turn[2, 2] * np.abs(turn[:2, :2]) @ observed.taper)
 
 
 def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.ndarray:
@@ -194,22 +200,16 @@ def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.nd
     if not bodies:
         return np.zeros(0, bool)
     shown = Superquadric.stack([each.superquadric for each in observed])
-    spanned = shown.size * np.stack([each.seen for each in observed])
+    spanned = shown.untapered().size * np.stack([each.seen for each in observed])
     wide = Superquadric.stack(bodies).support(np.swapaxes(shown.rotation_matrix, -1, -2))
     return np.asarray((spanned > _SPANNED * wide).any(axis=-1))
 
 
 def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
-    """The observed body and its covariance, in that of its equivalent forms which continues ``body``.
-
-    ``covariance`` (11, 11) is that of ``body``.
-    """
+    """The observed body and its covariance, in that of its forms which continues ``body`` with ``covariance``."""
     own = np.asarray(observation.covariance, dtype=float)
     known = np.isfinite(own).all()
-    found, changed = forms.named(
-        body.to_flat(),
-        covariance,
-        observation.superquadric.to_flat(),
-        own if known else np.zeros((LENGTH, LENGTH)),
-    )
+    given = own if known else np.zeros((LENGTH, LENGTH))
+    seen = observation.superquadric.untapered().to_flat()
+    found, changed = forms.rename_axes(body.to_flat(), covariance, seen, given)
     return Superquadric.from_flat(found), changed if known else own

@@ -1,15 +1,12 @@
-"""The state of a tracked body and the errors it is measured in.
+"""The state of a tracked body, its error, and covariances of it.
 
-State and error
----------------
-A state is the flat parameter vector (12,) of a superquadric in the world frame.  Its error lives in the 11 dimensions
+A state is the flat parameter vector (12,) of a superquadric in the world frame.  Its error has 11 dimensions,
 
-    a1, a2, a3,  e1, e2,  t1, t2, t3 (world),  w1, w2, w3 (rotation vector in the body's own frame)
+    a1, a2, a3,  e1, e2,  t1, t2, t3 (world),  w1, w2, w3 (rotation vector in the body's own frame),
 
-so that x + d has the sizes a + d_a, the exponents e + d_e, the centre t + d_t and the rotation R exp([d_w]).  Sizes are
-in metres as the fits' are, and not in logarithms: that something flat is twice as thick moves its centre by its
-thickness, and in logarithms that is another motion for each thickness that an observation takes it to have.  In the
-body's frame a turn of the world changes no number of the rotation.  Every function takes leading batch dimensions.
+and x + d has the sizes a + d_a, the exponents e + d_e, the centre t + d_t and the rotation R exp([d_w]).  Sizes are in
+metres, as in the fit's covariance, and not in logarithms: the centre of something flat that is seen from above moves by
+what its thickness changes, which is linear in metres alone.  All functions take leading batch dimensions.
 """
 
 from __future__ import annotations
@@ -24,24 +21,20 @@ from sq_perception.geometry.superquadric import Superquadric
 LENGTH = 11
 SIZE, SHAPE, CENTRE, TURN = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11)
 SIZE_AND_SHAPE, POSE = slice(0, 5), slice(5, 11)
-"""Parts of the error."""
 DETERMINED = 0.2
-"""Radians: a turn about an axis whose standard deviation is larger is not determined by an observation.  Chosen:
-three of them reach the next axis of a cube, and fewer another side of the body."""
-_LEFT = 0.1
-"""Share of a size that a correction leaves at least.  Chosen."""
-_SHAPE_LIMITS = (0.01, 2.0)
-"""Exponents: down to where the gauge was tried, up to where bodies are convex (:mod:`geometry.superquadric`)."""
+"""Standard deviation in radians up to which a rotation about an axis counts as measured.  Chosen: three of them stay
+below the 45 degrees at which another axis of the body is nearer."""
+_LIMITS = np.array([[1e-3] * 3 + [0.01] * 2, [np.inf] * 3 + [2.0] * 2])
+"""Least and greatest sizes (metres) and exponents that a correction leaves; bodies are convex up to exponents of 2."""
 
 
 class Observed(Protocol):
-    """What the tracker reads of a body of one frame, as :class:`~sq_perception.recovery.recoverer.Recovery` is.
+    """What the tracker needs of a body in one frame; :class:`~sq_perception.recovery.recoverer.Recovery` has it.
 
-    ``superquadric`` is a single body in the optical frame.  ``covariance`` is (11, 11), of a1 a2 a3 e1 e2 t1 t2 t3 and
-    the rotation vector in the object frame, metres and radians; NaN where unknown.  ``is_predicted`` tells that much of
-    it is a prediction's, which errs alike from everywhere.  ``repeats`` is above 0 for an answer that was given before,
-    of readings that are the same but for noise: its error is the same, too.  ``seen`` (3,) is the share, 0 to 1, of
-    each size that the measured points span.
+    ``superquadric`` is a single body in the optical frame and ``covariance`` (11, 11) that of its error, NaN where
+    unknown.  ``is_predicted``: a network's prediction is part of it, whose error is much the same from every side.
+    ``repeats`` > 0: the answer was given for an earlier frame whose readings differ by noise alone; its error is the
+    same again.  ``seen`` (3,) is the share of each size that the measured points span.
     """
 
     @property
@@ -61,39 +54,27 @@ class Observed(Protocol):
 
 
 def difference(state: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """The error (..., 11) that leads from one state (..., 12) to another."""
+    """The error (..., 11) of one state (..., 12) against another: ``add(state, difference(state, other))`` is other."""
     turn = quaternions.multiply(quaternions.conjugate(state[..., 8:12]), other[..., 8:12])
-    return np.concatenate(
-        [
-            other[..., 0:8] - state[..., 0:8],
-            quaternions.to_rotation_vector(turn),
-        ],
-        axis=-1,
-    )
+    return np.concatenate([other[..., 0:8] - state[..., 0:8], quaternions.to_rotation_vector(turn)], axis=-1)
 
 
-def moved(state: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """The state (..., 12) at the end of an error (..., 11); sizes stay above 0, exponents within (0, 2]."""
+def add(state: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """The state (..., 12) plus an error (..., 11); sizes stay positive, exponents within (0, 2]."""
     turn = quaternions.from_rotation_vector(error[..., TURN])
-    return np.concatenate(
-        [
-            np.maximum(state[..., 0:3] + error[..., SIZE], _LEFT * state[..., 0:3]),
-            np.clip(state[..., 3:5] + error[..., SHAPE], *_SHAPE_LIMITS),
-            state[..., 5:8] + error[..., CENTRE],
-            quaternions.normalize(quaternions.multiply(state[..., 8:12], turn)),
-        ],
-        axis=-1,
-    )
+    rotation = quaternions.normalize(quaternions.multiply(state[..., 8:12], turn))
+    size_and_shape = np.clip(state[..., 0:5] + error[..., SIZE_AND_SHAPE], *_LIMITS)
+    return np.concatenate([size_and_shape, state[..., 5:8] + error[..., CENTRE], rotation], axis=-1)
 
 
-def in_metres(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Covariances (..., 11, 11) of errors in shares of the sizes (..., 3) -> of errors in metres."""
+def scale_sizes(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Covariances (..., 11, 11) with errors of size as shares of the sizes (..., 3) -> in metres."""
     scale = np.concatenate([size, np.ones((*size.shape[:-1], LENGTH - 3))], axis=-1)
     return np.asarray(scale[..., :, None] * covariance * scale[..., None, :])
 
 
-def turned(covariance: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Covariances (..., 11, 11) of bodies in one frame -> in a frame that is turned, p_new = matrix (3, 3) p."""
+def rotate(covariance: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Covariances (..., 11, 11) in a frame that is rotated, p_new = matrix (3, 3) p."""
     change = np.eye(LENGTH)
     change[CENTRE, CENTRE] = matrix
     return change @ covariance @ change.T
@@ -110,10 +91,8 @@ def diagonal(size: float, shape: float, centre: float, turn: float) -> np.ndarra
     return np.diag(np.square([size] * 3 + [shape] * 2 + [centre] * 3 + [turn] * 3))
 
 
-def as_pose(pose: object) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (4,), a quaternion x y z w, and translation (3,) of a pose.
-
-    ``pose`` is a 4 x 4 matrix or a pair (quaternion, translation); None is the identity.
+def parse_pose(pose: object) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (4,), a quaternion x y z w, and translation (3,) of a 4 x 4 matrix or a pair of them; None: identity.
 
     Raises
     ------

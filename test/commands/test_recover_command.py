@@ -15,6 +15,7 @@ from sq_perception.commands import main, recover_outputs
 from sq_perception.commands.console import complain
 from sq_perception.commands.recover_lines import lines
 from sq_perception.fitting.fit import CUT_SHORT
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import COLOURS
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
@@ -35,8 +36,8 @@ BODIES = Superquadric(
 )
 
 
-def save_npz(path, depth=None):
-    rendered, index = raycast.render(BODIES, CAMERA)
+def save_npz(path, depth=None, bodies=BODIES):
+    rendered, index = raycast.render(bodies, CAMERA)
     depth = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32) if depth is None else depth
     np.savez(path, depth=depth, K=CAMERA.matrix, labels=index + 1)
     return path
@@ -335,6 +336,42 @@ def test_track_puts_ids_into_the_json(tmp_path, capsys):
         assert last["fused"]
         truth = min(BODIES.size, key=lambda size: abs(np.prod(size) / np.prod(last["size"]) - 1))
         np.testing.assert_allclose(np.sort(last["size"]), np.sort(truth), rtol=0.019)
+
+
+def test_poses_make_one_scene_of_several_cameras(tmp_path, capsys, repository):
+    """From four sides: every body once, in the world of the poses, surer than in one frame; bad files are named."""
+    jsonschema = pytest.importorskip("jsonschema")
+    middle, world = BODIES.translation.mean(axis=0), np.array([1.0, -2.0, 0.5])
+    names, poses = [], []
+    for k in range(4):
+        turn = quaternions.from_rotation_vector(np.array([0.0, 0.5 * k, 0.0]))
+        position = middle - quaternions.to_matrix(turn) @ middle
+        names.append(tmp_path / f"camera{k}" / "depth.npz")
+        names[k].parent.mkdir()
+        back = quaternions.conjugate(turn)
+        save_npz(names[k], bodies=BODIES.transformed(back, -quaternions.to_matrix(back) @ position))
+        poses.append(f"{names[k]} " + " ".join(map(str, [*(position + world), *turn])))
+    file = tmp_path / "poses.txt"
+    file.write_text("# name tx ty tz qx qy qz qw\n" + "\n".join(poses))
+    frames = recover(tmp_path, *names, "--poses", file)
+    document = json.loads((tmp_path / "out.json").read_text())
+    schema = json.loads((repository / "sq_perception" / "recordings" / "result.schema.json").read_text())
+    jsonschema.validate(document, schema)
+    scene = document["scene"]
+    assert [(body["id"], body["seen"]) for body in scene] == [(1, 4), (2, 4)]
+    for body in scene:
+        truth = int(np.argmin(np.linalg.norm(BODIES.translation + world - body["translation"], axis=1)))
+        np.testing.assert_allclose(body["translation"], BODIES.translation[truth] + world, atol=0.003)
+        np.testing.assert_allclose(np.sort(body["size"]), np.sort(BODIES.size[truth]), rtol=0.05)
+        first = next(one["track"] for one in frames[0]["superquadrics"] if one["track"]["id"] == body["id"])
+        assert np.prod(body["sigma_size"]) < 0.5 * np.prod(first["sigma_size"])
+    file.write_text(poses[0])
+    assert len(recover(tmp_path, *names[:2], "--poses", file, code=1)) == 1
+    assert "no pose" in capsys.readouterr().err
+    file.write_text(f"{poses[0]}\nb 1 2 3 0 0 0")
+    assert run(names[0], "--poses", file) == 2
+    assert "line 2" in capsys.readouterr().err
+    assert main.main(["recover", str(names[0]), "--poses", str(file), "--method", "classic"]) == 2
 
 
 def test_track_is_asked_for_and_says_where_stamps_are_missing(tmp_path, capsys):

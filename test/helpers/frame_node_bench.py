@@ -58,14 +58,17 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         self.warm = camera
 
-    def recover(
-        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any, previous: Any = None
-    ) -> FrameRecovery:
+    def recover(self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any) -> FrameRecovery:
         self.asked.append((depth, camera, labels, options))
         assert self.gate.wait(PATIENCE)
         if self.error is not None:
             raise self.error
         return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), self.plane, self.message)
+
+
+def every_frame_anew(recoverer: Any, last: Any) -> Any:
+    """A stand-in for a StillScene that repeats nothing."""
+    return SimpleNamespace(recover=recoverer.recover, last=None)
 
 
 class Bench(SpunNodes):
@@ -75,7 +78,8 @@ class Bench(SpunNodes):
         super().__init__(*arguments)
         self.recoverer = Recoverer()
         weights = SimpleNamespace(resolve=lambda _: Path(f"weights of {id(self)}"), check=lambda _: None)
-        self.stand_ins = patch.multiple(engine, Recoverer=lambda *_, **__: self.recoverer, checkpoint=weights)
+        made = {"Recoverer": lambda *_, **__: self.recoverer, "StillScene": every_frame_anew}
+        self.stand_ins = patch.multiple(engine, checkpoint=weights, **made)
         self.stand_ins.start()
         self.node = FrameNode("recover_node", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
@@ -84,7 +88,7 @@ class Bench(SpunNodes):
         self.spin([self.node])
         self.until(lambda: self.node.is_active)
         if self.node._settings.current.image_transport == "raw":
-            self.until(lambda: self.images.get_subscription_count() == 1)
+            self.until(self.images.get_subscription_count)
         self.until(lambda: self.node._outputs.superquadrics.get_subscription_count() == 1)
         self.stamps = 0
 
@@ -114,7 +118,7 @@ class Bench(SpunNodes):
         return intrinsics_to_message(known, self.header())
 
     def put_info(self, message: CameraInfo) -> None:
-        self.until(lambda: self.infos.get_subscription_count() == 1)
+        self.until(self.infos.get_subscription_count)
         before = sum(1 for _ in self.node._input._infos)
         assert before < self.node._input._infos.maxlen
         self.infos.publish(message)

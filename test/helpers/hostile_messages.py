@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from children import Child
 from hypothesis import strategies as st
 from running_nodes import Peer, until
 from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
@@ -23,7 +24,6 @@ from std_srvs.srv import Trigger
 
 from sq_msgs_py.depth_image import Intrinsics, byte_array, intrinsics_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray
-from sq_perception.commands.children import Child
 
 SIZES = ((1, 1), (1, 2), (2, 2), (3, 7), (16, 12), (33, 21), (64, 48), (80, 60), (1, 200), (200, 1), (160, 120))
 """Width and height of sound images."""

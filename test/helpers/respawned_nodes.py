@@ -20,10 +20,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from children import Child
 from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
 
-from sq_perception.commands.children import Child
 from sq_perception.nodes.fast_dds import FOLDER
 
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"

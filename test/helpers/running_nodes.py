@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from children import Child
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -23,7 +24,6 @@ from spun_nodes import SpunNodes
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
-from sq_perception.commands.children import Child
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds

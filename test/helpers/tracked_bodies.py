@@ -11,8 +11,7 @@ from sq_perception.fitting import covariance as fit_covariance
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import agreement, forms, state, tracker
-from sq_perception.tracking import body as track_body
+from sq_perception.tracking import forms, gating, state, track, tracker
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
@@ -32,10 +31,10 @@ def nothing_but_the_covariances(patch, common, lasting):
     nought = np.zeros_like(tracker.LEAST)
     for module, name, value in (
         (tracker, "LEAST", nought),
-        (track_body, "DRIFT", nought),
+        (track, "DRIFT", nought),
         (tracker, "COMMON_SHARE", common),
         (tracker, "LASTING_SHARE", lasting),
-        (agreement, "LIMITS", {freedom: chi2.ppf(1 - 1e-9, freedom) for freedom in agreement.LIMITS}),
+        (gating, "LIMITS", {freedom: chi2.ppf(1 - 1e-9, freedom) for freedom in gating.LIMITS}),
     ):
         patch.setattr(module, name, value)
     return tracker.Tracker()
@@ -74,8 +73,8 @@ def draw(truth, covariance, rng, form=None, error=None):
     """An observation of a body in a frame where its covariance holds; in a random form."""
     if error is None:
         error = rng.multivariate_normal(np.zeros(11), covariance)
-    seen = Superquadric.from_flat(state.moved(truth.to_flat(), np.r_[error[:3] * truth.size, error[3:]]))
-    metres = state.in_metres(covariance, truth.size)
+    seen = Superquadric.from_flat(state.add(truth.to_flat(), np.r_[error[:3] * truth.size, error[3:]]))
+    metres = state.scale_sizes(covariance, truth.size)
     form = rng.integers(8) if form is None else form
     other = seen.equivalent_forms()[int(form)]
     return Seen(other, fit_covariance.carried_over(metres, seen, other))
@@ -93,7 +92,7 @@ def from_camera(seen, rotation, position):
     back = quaternions.conjugate(rotation)
     matrix = quaternions.to_matrix(back)
     local = seen.superquadric.transformed(back, -matrix @ position)
-    return Seen(local, state.turned(seen.covariance, matrix))
+    return Seen(local, state.rotate(seen.covariance, matrix))
 
 
 def looking_at(target, direction, distance):
@@ -108,11 +107,12 @@ def looking_at(target, direction, distance):
 
 def error_of(track, truth):
     """Error of a track in the truth's nearest form, and its covariance, in shares of the true sizes."""
-    (seen,), (known,) = forms.nearest(
-        truth.to_flat()[None], 1e-9 * np.eye(11)[None], track.superquadric.to_flat()[None], track.covariance[None], 0.0
-    )
-    error = state.difference(truth.to_flat(), seen)
-    return np.r_[error[:3] / truth.size, error[3:]], state.in_metres(known, 1 / truth.size)
+    exact = forms.candidates(track.superquadric.to_flat())[: forms.EXACT]
+    errors = state.difference(truth.to_flat(), exact)
+    changed = forms._CHANGES[: forms.EXACT] @ track.covariance @ forms._CHANGES[: forms.EXACT].swapaxes(-1, -2)
+    best = np.argmin(state.mahalanobis(changed + 1e-9 * np.eye(11), errors))
+    error, known = errors[best], changed[best]
+    return np.r_[error[:3] / truth.size, error[3:]], state.scale_sizes(known, 1 / truth.size)
 
 
 def nees(track, truth):

@@ -11,9 +11,13 @@ import soft_messages
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
+from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from spun_nodes import SpunNodes
 from std_msgs.msg import Header
@@ -51,8 +55,10 @@ def bodies():
 
 
 class Bench(SpunNodes):
-    def __init__(self):
-        super().__init__()
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.said = self.hear(Log, "/rosout", QoSProfile(depth=50, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL))
+        self.reports = self.hear(DiagnosticArray, "/diagnostics")
         self.node = GraspNode("grasp_node", context=self.context)
         self.heard = {}
         for kind, topic in ((PoseArray, "grasps"), (PointCloud2, "grasp_details"), (MarkerArray, "markers")):
@@ -73,6 +79,22 @@ class Bench(SpunNodes):
         self.cloud.publish(message)
         self.until(lambda: len(self.heard) == 3)
         return self.heard
+
+    def says(self, words):
+        self.until(lambda: any(words in entry.msg for entry in tuple(self.said)))
+
+    def report(self, condition):
+        """The first report of which that holds: level, message, values."""
+
+        def found():
+            for report in tuple(self.reports):
+                values = {pair.key: pair.value for pair in report.status[0].values}
+                if condition(report.status[0], values):
+                    return [(report.status[0], values)]
+            return None
+
+        self.until(found)
+        return found()[0]
 
     def close(self):
         self.node.close()
@@ -104,6 +126,60 @@ def test_grasps_come_best_first_with_the_header_of_the_bodies(bench):
     assert {marker.id for marker in heard["markers"].markers} == {BOX, CAN}
     tips = details.position[:, 2] - 0.0095  # the plane is z = 0
     assert (tips > 0).all()
+
+
+def test_the_node_says_what_it_listens_to_and_diagnostics_what_it_did(bench):
+    bench.says("ready, listening to /superquadrics")
+    bench.answer(to_message(bodies(), HEADER))
+    status, values = bench.report(lambda status, values: values["answered"] == "1")
+    assert (status.level, status.name) == (DiagnosticStatus.OK, "grasp_node: clouds")
+    assert "grasps of 3 bodies" in values["last answer"]
+    assert float(values["plan: median [ms]"]) > 0
+    assert float(values["age of the bodies [s]"]) >= 0
+    bench.cloud.publish(PointCloud2(width=3, height=1))
+    status, values = bench.report(lambda status, values: values["refused"] == "1")
+    assert values["last error"]
+    assert (values["received"], values["in work"]) == ("2", "0")
+
+
+def test_silence_is_reported_with_who_publishes():
+    with Bench("-p", "no_cloud_warning:=0.1") as bench:
+        bench.says("no superquadrics on /superquadrics for")
+        bench.says("1 publisher: /peer")
+        bench.report(lambda status, _: status.message == "no superquadrics arrive")
+        bench.peer.destroy_publisher(bench.cloud)
+        bench.until(lambda: bench.node._clouds.publishers == "nobody publishes it")
+        bench.says("nobody publishes it")
+
+
+def test_old_bodies_are_not_planned_for():
+    """By the node's clock, here a simulated one: from the image's stamp, or the cloud's arrival where it has none."""
+    with Bench("-p", "use_sim_time:=true", "-p", "max_age:=10.0") as bench:
+        clock = bench.peer.create_publisher(Clock, "/clock", 10)
+        bench.until(clock.get_subscription_count)
+
+        def at(seconds):
+            clock.publish(Clock(clock=Time(sec=seconds)))
+            bench.until(lambda: bench.node.get_clock().now().nanoseconds == seconds * 10**9)
+
+        def planned():
+            return bench.call(Trigger, "/grasp_node/plan")
+
+        at(1000)
+        bench.answer(to_message(bodies(), Header(stamp=Time(sec=997), frame_id="base_link")))
+        at(1007)
+        assert '; 10.0 s old"' in planned().message
+        at(1008)
+        answer = planned()
+        assert not answer.success
+        assert answer.message == "the last superquadrics are 11.0 s old, and max_age is 10 s"
+        bench.answer(to_message(bodies(), Header(frame_id="base_link")))
+        at(1018)
+        assert planned().success
+        at(1019)
+        assert not planned().success
+        assert bench.node.set_parameters([Parameter("max_age", value=0)])[0].successful
+        assert planned().success
 
 
 def test_bodies_of_the_unit_cube_are_refused(bench):
@@ -141,7 +217,7 @@ def test_a_region_may_be_asked_for_and_the_answer_has_its_grasps(bench):
     bench.node.set_parameters([Parameter("only_id", value=BOX)])
     answer = bench.call(Trigger, "/grasp_node/plan")
     assert not answer.success
-    assert answer.message == "0 grasps of 3 bodies; only_id and region leave none"
+    assert answer.message.startswith("0 grasps of 3 bodies; only_id and region leave none; ")
 
 
 def test_bodies_are_grasped_however_far_away_the_origin_of_a_map_is(bench):

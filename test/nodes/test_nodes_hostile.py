@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from children import Children
 from hostile_messages import HostileFrame, Siege, difference, frames, hostile_infos, images, masks, sound_info
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -25,7 +26,6 @@ from sq_msgs_py.depth_image import (
     labels_from_message,
 )
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.commands.children import Children
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
 

@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from children import Child, Children
 from hostile_messages import difference
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
@@ -20,7 +21,6 @@ from running_nodes import BODIES, CAMERA, Peer, arguments, environment, until
 from std_srvs.srv import SetBool
 
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.commands.children import Child, Children
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from children import Child, command
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from running_nodes import BODIES, CAMERA, PATIENCE, Peer, arguments, environment, nanoseconds, until
@@ -21,7 +22,6 @@ from std_srvs.srv import SetBool
 
 from sq_msgs_py.depth_image import depth_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.commands.children import Child, command
 from sq_perception.geometry.metrics import thesis_iou, volume_iou
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.publication import superquadrics
@@ -66,8 +66,8 @@ def start() -> Iterator[Callable[..., Process]]:
     """Starts nodes; whatever a test leaves running is killed at the end."""
     processes: list[Process] = []
 
-    def begin(node: str, *parameters: str) -> Process:
-        processes.append(Process(node, arguments(*parameters), environment()))
+    def begin(node: str, *parameters: str, before: Sequence[str] = ()) -> Process:
+        processes.append(Process(node, [*before, *arguments(*parameters)], environment()))
         return processes[-1]
 
     yield begin
@@ -242,6 +242,8 @@ def test_a_missing_or_corrupt_model_ends_the_start_with_a_reason(start, tmp_path
         ("recover_node", "s:=1e9", "out of range"),
         ("synthetic_depth_node", "scene:=replay", "path"),
         ("recover_node", "qos_overrides./depth/image.subscription.reliability:=perhaps", "perhaps"),
+        ("recover_node", "device:=tpu", "expected cpu, cuda or cuda:N"),
+        ("recover_node", "tf_prefix:=''", "expected something before the ids"),
     ],
 )
 def test_a_bad_parameter_ends_the_start_with_a_reason(start, node, parameter, words):
@@ -249,6 +251,15 @@ def test_a_bad_parameter_ends_the_start_with_a_reason(start, node, parameter, wo
     assert process.wait(PATIENCE) == 1
     assert words in process.output()
     assert "Traceback" not in process.output()
+
+
+def test_bodies_of_two_cameras_have_names_of_their_own(peer, start):
+    """Also said: what nodes that do not start themselves wait for."""
+    process = start("recover_cameras", "autostart:=false", before=["front", "arm/wrist"])
+    process.says("waiting for a lifecycle manager, or for ros2 lifecycle set /arm/wrist/recover_node configure")
+    prefixes = [peer.get(f"/{one}/recover_node", "tf_prefix", alive=(process,)) for one in ("front", "arm/wrist")]
+    assert prefixes == [["front_superquadric_"], ["arm_wrist_superquadric_"]]
+    stopped(process)
 
 
 def test_cameras_that_would_have_one_name_are_refused(tmp_path):

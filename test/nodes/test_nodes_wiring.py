@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import fields
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -305,7 +304,7 @@ def test_triggers_leave_nothing_behind(bench):
 
 def test_masks_without_a_stamp_belong_to_no_image(bench):
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
-    bench.until(lambda: masks.get_subscription_count() == 1)
+    bench.until(masks.get_subscription_count)
     bench.node._input._on_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
     image = bench.depth()
     image.header = Header(frame_id=FRAME_ID)
@@ -315,7 +314,7 @@ def test_masks_without_a_stamp_belong_to_no_image(bench):
 
 def test_masks_of_the_same_stamp_are_used(bench):
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
-    bench.until(lambda: masks.get_subscription_count() == 1 and bench.node.count_publishers("/mask/image"))
+    bench.until(lambda: masks.get_subscription_count() and bench.node.count_publishers("/mask/image"))
     image = bench.depth()
     labels = np.zeros((48, 64), np.int32)
     labels[3:9, 4:8] = 7
@@ -347,7 +346,7 @@ def test_a_mask_that_comes_while_the_node_is_busy_is_used(make_bench):
     bench = make_bench("-p", "patience:=0.0")
     bench.send_info()
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
-    bench.until(lambda: masks.get_subscription_count() == 1 and bench.node.count_publishers("/mask/image"))
+    bench.until(lambda: masks.get_subscription_count() and bench.node.count_publishers("/mask/image"))
     assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
     bench.recoverer.gate.clear()
     bench.images.publish(bench.depth())
@@ -453,10 +452,13 @@ def test_diagnostics_count_and_warn(bench):
 
 
 def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
-    image = bench.node._input._image
-    bench.node._input._on_lost(image, SimpleNamespace(total_count=3, total_count_change=3))
-    bench.node._input._on_lost(image, SimpleNamespace(total_count=5, total_count_change=2))
-    bench.node._input._on_lost(bench.node._input._info, SimpleNamespace(total_count=1, total_count_change=1))
+    deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+    bench.peer.create_publisher(Image, "depth/image", deaf)
+    source = bench.node._input
+    bench.until(lambda: source._image.qos.reliability == QoSReliabilityPolicy.BEST_EFFORT)
+    source._image._on_lost(3, 3)
+    source._image._on_lost(5, 2)
+    source._info._on_lost(1, 1)
     assert bench.counts.lost == {"/depth/image": 5, "/depth/camera_info": 1}
     said = capfd.readouterr().err
     assert said.count(f"FASTRTPS_DEFAULT_PROFILES_FILE={fast_dds.profile_path()}") == 1
@@ -465,10 +467,49 @@ def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
 
 def test_the_remedy_for_lost_messages_fits_the_subscription(make_bench, capfd):
     bench = make_bench("-p", "qos_overrides./depth/image.subscription.reliability:=reliable")
-    bench.node._input._on_lost(bench.node._input._image, SimpleNamespace(total_count=3, total_count_change=3))
+    bench.node._input._image._on_lost(3, 3)
     said = capfd.readouterr().err
     assert "Raise the depth of the PUBLISHER" in said
     assert "FASTRTPS" not in said
+
+
+def test_a_subscription_is_as_reliable_as_its_publishers(make_bench):
+    """Reliable while all of them are: a large best effort message is often lost; deaf to none of them."""
+    bench = make_bench()
+    heard = bench.node._input._image
+    reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
+    bench.send_info()
+
+    def offered() -> set[QoSReliabilityPolicy]:
+        """By the node, as others see it."""
+        found = bench.peer.get_subscriptions_info_by_topic("/depth/image")
+        return {one.qos_profile.reliability for one in found}
+
+    bench.until(lambda: offered() == {reliable})
+    assert len(bench.answer(bench.depth())[1]) == 1
+    other = bench.peer.create_publisher(Image, "depth/image", QoSProfile(depth=1, reliability=best_effort))
+    bench.until(lambda: offered() == {best_effort})
+    bench.until(other.get_subscription_count)
+    assert "INCOMPATIBLE" not in heard.publishers
+    bench.images, kept = other, bench.images
+    assert len(bench.answer(bench.depth())[1]) == 1
+    bench.peer.destroy_publisher(other)
+    bench.images = kept
+    bench.until(lambda: offered() == {reliable})
+    bench.until(kept.get_subscription_count)
+    assert len(bench.answer(bench.depth())[1]) == 1
+
+
+@pytest.mark.parametrize("asked", ["best_effort", "reliable"])
+def test_a_reliability_that_was_asked_for_stays(make_bench, asked):
+    bench = make_bench("-p", f"qos_overrides./depth/image.subscription.reliability:={asked}")
+    mixed = asked == "reliable"
+    if mixed:
+        bench.peer.create_publisher(Image, "depth/image", QoSProfile(depth=1, reliability=QoSReliabilityPolicy(2)))
+    bench.until(lambda: bench.node.count_publishers("/depth/image") == 1 + mixed)
+    bench.node._input.follow_publishers()
+    (seen,) = bench.peer.get_subscriptions_info_by_topic("/depth/image")
+    assert seen.qos_profile.reliability.name.lower() == asked
 
 
 def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
@@ -486,6 +527,18 @@ def test_what_is_left_out_of_a_frame_is_said(bench):
     bench.recoverer.message = "there are more objects than max_objects = 1: smaller ones are left out"
     assert len(bench.answer(bench.depth())[1]) == 1
     bench.until(lambda: [entry for entry in log if "more objects than max_objects = 1" in entry.msg])
+
+
+def test_images_without_a_frame_are_answered_and_one_warning_says_what_that_means(bench):
+    log = bench.hear(Log, "/rosout", 50)
+    for _ in range(3):
+        image = bench.depth()
+        image.header.frame_id = ""
+        assert bench.answer(image)[0].header.frame_id == ""
+    bench.until(lambda: [entry for entry in log if "the images have no frame_id" in entry.msg])
+    bench.node.get_logger().info("the last line")
+    bench.until(lambda: log[-1].msg == "the last line")
+    assert sum("no frame_id" in entry.msg for entry in log) == 1
 
 
 def test_silence_is_reported(make_bench):

@@ -52,7 +52,7 @@ PROPERTIES = {
 }
 """What each display has beside Class, Enabled, Name and Value."""
 TOPIC = {"Depth", "Durability Policy", "History Policy", "Reliability Policy", "Value"}
-RELIABLE_TOPICS = {"/recover_node/markers", "/fitter_node/markers"}
+RELIABLE_TOPICS = {"/recover_node/markers", "/fitter_node/markers", "/grasp_node/markers"}
 """Few and small, and a lost deletion would leave a body on the screen; images are best effort, as cameras are."""
 
 
@@ -98,7 +98,7 @@ def test_topics_and_frame_are_those_of_the_nodes(
     named += [one["Depth Map Topic"] for one in displays if "Depth Map Topic" in one]
     for topic in named:
         node, _, name = topic.removeprefix("/").partition("/")
-        literal = f'"~/{name}"' if node in ("recover_node", "fitter_node") else f'"{node}/{name}"'
+        literal = f'"~/{name}"' if node in ("recover_node", "fitter_node", "grasp_node") else f'"{node}/{name}"'
         assert literal in code, topic
     frame = configuration["Visualization Manager"]["Global Options"]["Fixed Frame"]
     assert frame == CAMERA_FRAME

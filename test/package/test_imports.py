@@ -23,7 +23,7 @@ LAYERS = (
     ("imaging", "tracking"),
     ("segmentation", "simulation"),
     ("learning", "fitting", "grasping"),
-    ("recovery", "viewing"),
+    ("recovery",),
     ("recordings",),
     ("evaluation",),
     ("nodes",),
@@ -136,7 +136,7 @@ def test_only_the_commands_that_run_nodes_import_them() -> None:
         path for path in PERCEPTION.rglob("*.py") if any(subpackage(name) == "nodes" for name, _ in imports(path))
     }
     here = {path for path in importing if not is_node(path)}
-    assert here == {PERCEPTION / "commands" / name for name in ("demonstration.py", "view.py")}
+    assert here == {PERCEPTION / "commands" / name for name in ("demo.py",)}
 
 
 def test_no_module_waits_for_itself() -> None:

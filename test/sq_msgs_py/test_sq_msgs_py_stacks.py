@@ -243,6 +243,30 @@ def test_a_scene_tells_what_changes():
     assert scene.clear() == []
 
 
+def test_a_round_body_at_rest_is_sent_once():
+    """Its rotation about its own axis is arbitrary, as are all rotations of a ball, and axes of equal length swap."""
+    rng, scene = np.random.default_rng(11), Scene()
+    can = three().where(np.array([False, False, True]))
+    ball = replace(can, size=np.full((1, 3), 0.04), shape=np.ones((1, 2)), id=np.array([7]))
+    box = replace(can, size=np.array([[0.05, 0.03, 0.03]]), shape=np.full((1, 2), 0.2), id=np.array([8]))
+    assert len(scene.changes(can, HEADER)) == 1
+    for _ in range(20):
+        angle = rng.uniform(0, np.pi)
+        turned = poses.product(can.rotation, np.array([0.0, 0.0, np.sin(angle), np.cos(angle)]))
+        quivering = replace(can, rotation=turned, translation=can.translation + rng.normal(0, 1e-4, 3))
+        assert scene.changes(quivering, HEADER) == []
+    tilted = poses.product(can.rotation, np.array([np.sin(0.02), 0.0, 0.0, np.cos(0.02)]))
+    assert len(scene.changes(replace(can, rotation=tilted), HEADER)) == 1, "its rims have moved by 2.7 mm"
+    scene = Scene()
+    assert len(scene.changes(ball, HEADER)) == 1
+    for rotation in quaternions.random(20, rng):
+        assert scene.changes(replace(ball, rotation=rotation[None]), HEADER) == []
+    scene = Scene()
+    assert len(scene.changes(box, HEADER)) == 1
+    swapped = replace(box, size=box.size[:, [1, 0, 2]], rotation=poses.product(box.rotation, QUARTER_ABOUT_Z))
+    assert scene.changes(swapped, HEADER) == [], "a quarter turn of a box whose edges swap is the same box"
+
+
 def test_names():
     assert name(np.uint32(7)) == "superquadric_7"
     assert name(7, "left_") == "left_7"

@@ -56,13 +56,12 @@ def test_the_nearest_form_undoes_any_exact_one_with_its_covariance(rng):
         seen = draw(truth, covariance, rng, form, np.zeros(11))
         states, covariances = forms.nearest(
             truth.to_flat()[None],
-            state.in_metres(noise(), truth.size)[None],
+            state.scale_sizes(noise(), truth.size)[None],
             seen.superquadric.to_flat()[None],
             seen.covariance[None],
-            0.3,
         )
         np.testing.assert_allclose(state.difference(truth.to_flat(), states[0]), 0, atol=1e-9)
-        np.testing.assert_allclose(covariances[0], state.in_metres(covariance, truth.size), atol=1e-12)
+        np.testing.assert_allclose(covariances[0], state.scale_sizes(covariance, truth.size), atol=1e-12)
 
 
 def test_z_changes_places_only_where_the_exponents_are_alike(rng):
@@ -74,10 +73,9 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
         count = len(flat)
         states, _ = forms.nearest(
             np.tile(truth.to_flat(), (count, 1)),
-            state.in_metres(noise(), np.tile(truth.size, (count, 1))),
+            state.scale_sizes(noise(), np.tile(truth.size, (count, 1))),
             flat,
-            state.in_metres(noise(), flat[:, :3]),
-            0.3,
+            state.scale_sizes(noise(), flat[:, :3]),
         )
         turn = quaternions.geodesic_angle(states[:, 8:12], truth.rotation)
         assert (turn[: forms.EXACT] < 1e-6).all()

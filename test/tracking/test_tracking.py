@@ -29,7 +29,7 @@ from sq_perception.imaging.raycast import render
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
 from sq_perception.simulation.sensor_model import Ideal
-from sq_perception.tracking import agreement, association, sight, state
+from sq_perception.tracking import association, gating, state, visibility
 from sq_perception.tracking import tracker as tracker_module
 from sq_perception.tracking.tracker import FORGET_AFTER, Tracker, TrackState
 
@@ -47,8 +47,8 @@ def crossing(k, rng, same=True):
 def test_what_repeats_all_bodies_gives_what_a_comparison_gives(monkeypatch):
     """Answers of still frames, in any order, some of them missing; new ones, moved bodies and cameras between them."""
     rng, bodies = np.random.default_rng(0), spread_bodies(4, np.random.default_rng(1))
-    quick, thorough, repeated, shortcuts = Tracker(), Tracker(), tracker_module._repeated, []
-    monkeypatch.setattr(tracker_module, "_repeated", lambda *some: shortcuts.append(repeated(*some)) or shortcuts[-1])
+    quick, thorough, repeated, shortcuts = Tracker(), Tracker(), tracker_module._repeat, []
+    monkeypatch.setattr(tracker_module, "_repeat", lambda *some: shortcuts.append(repeated(*some)) or shortcuts[-1])
     seen, pose = [draw(each, noise(), rng) for each in bodies], (np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
     for k in range(200):
         happens = rng.random()
@@ -62,7 +62,7 @@ def test_what_repeats_all_bodies_gives_what_a_comparison_gives(monkeypatch):
         shown = [old[i] for i in rng.permutation(4)[: rng.integers(3, 5)]]
         tracks = quick.update(shown, 0.05 * k, pose)
         with monkeypatch.context() as patch:
-            patch.setattr(tracker_module, "_repeated", lambda *_: None)
+            patch.setattr(tracker_module, "_repeat", lambda *_: None)
             compared = thorough.update(shown, 0.05 * k, pose)
         for one, other in zip(tracks, compared, strict=True):
             assert (one.id, one.seen, one.state, one.observation) == (
@@ -299,7 +299,7 @@ def test_a_motion_of_the_world_changes_nothing(rng):
         for a, b in zip(one, other, strict=True):
             carried = a.superquadric.transformed(turn, shift)
             np.testing.assert_allclose(state.difference(carried.to_flat(), b.superquadric.to_flat()), 0, atol=1e-7)
-            expected = state.turned(a.covariance, quaternions.to_matrix(turn))
+            expected = state.rotate(a.covariance, quaternions.to_matrix(turn))
             np.testing.assert_allclose(b.covariance, expected, atol=1e-9)
 
 
@@ -313,7 +313,7 @@ def test_a_turn_of_the_world_changes_no_second_look(rng):
         (one,), (other,) = here.update(seen, 0.1 * k), there.update(seen, 0.1 * k, (turn, np.zeros(3)))
         carried = one.superquadric.transformed(turn, np.zeros(3))
         np.testing.assert_allclose(state.difference(carried.to_flat(), other.superquadric.to_flat()), 0, atol=1e-9)
-        expected = state.turned(one.covariance, quaternions.to_matrix(turn))
+        expected = state.rotate(one.covariance, quaternions.to_matrix(turn))
         np.testing.assert_allclose(other.covariance, expected, atol=1e-12)
 
 
@@ -334,7 +334,7 @@ def test_open_share_knows_the_image_and_what_stands_in_front():
     bodies = Superquadric.stack([body(), body(centre=(3, 0, 0.8)), body(centre=(0, 0, -0.8))])
     for measured, share in ((np.nan, 0), (0.5, 0), (2.0, 1)):
         depth = np.full((CAMERA.height, CAMERA.width), measured)
-        np.testing.assert_array_equal(sight.open_share(bodies, CAMERA, depth), [share, 0, 0])
+        np.testing.assert_array_equal(visibility.open_share(bodies, CAMERA, depth), [share, 0, 0])
 
 
 @pytest.mark.parametrize("nothing", [np.nan, 0.0])
@@ -343,7 +343,7 @@ def test_what_is_gone_is_seen_to_have_gone_by_an_image_of_single_readings(nothin
     row, column = np.indices((CAMERA.height, CAMERA.width))
     depth = np.where((row % 3 == 1) & (column % 3 == 1), 2.0, nothing)
     bodies = Superquadric.stack([body(), body(centre=(0.05, 0.03, 0.7)), body(centre=(0, 0, 3))])
-    np.testing.assert_array_equal(sight.open_share(bodies, CAMERA, depth), [1, 1, 0])
+    np.testing.assert_array_equal(visibility.open_share(bodies, CAMERA, depth), [1, 1, 0])
 
 
 def test_masked_readings_are_no_empty_space(rng):
@@ -450,7 +450,7 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
 
 
 def test_the_limits_of_chi_squared_are_scipys():
-    for freedom, limit in agreement.LIMITS.items():
+    for freedom, limit in gating.LIMITS.items():
         assert limit == pytest.approx(chi2.ppf(0.999, freedom), rel=1e-12)
 
 

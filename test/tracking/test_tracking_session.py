@@ -59,7 +59,7 @@ def test_what_spans_more_than_its_track_is_published_as_it_is_seen(rng):
     """A bowl in the place of a carton: of sizes so unsure that they might be the carton's, but nothing that small can
     be seen so wide.  What stays is seen to its ends, and fused."""
     carton, bowl = body((0.04, 0.03, 0.025)), body((0.1, 0.09, 0.06))
-    unsure = state.in_metres(noise(0.3, 0.5, 0.05, 0.5), bowl.size)
+    unsure = state.scale_sizes(noise(0.3, 0.5, 0.05, 0.5), bowl.size)
     for spanned in (np.full(3, np.nan), np.array([0.9, 0.9, 0.5])):
         one = TrackingSession()
         for k in range(10):
@@ -181,11 +181,11 @@ def test_a_turn_that_the_image_leaves_open_is_that_of_the_track(deviation, shown
     """0.7 radians about the axis of a can: chance where the fit says that it knows no better, and else a hand."""
     truth, one = body((0.04, 0.04, 0.03), (0.2, 0.95)), TrackingSession()
     covariance = noise(turn=0.01)
-    one.follow([Seen(truth, state.in_metres(covariance, truth.size))], 0.0)
+    one.follow([Seen(truth, state.scale_sizes(covariance, truth.size))], 0.0)
     error = np.zeros(11)
     error[10], covariance[10, 10] = 0.7, deviation**2
-    turned = Superquadric.from_flat(state.moved(truth.to_flat(), error))
-    (found,) = one.follow([Seen(turned, state.in_metres(covariance, truth.size))], 0.1, is_pose_known=False)
+    turned = Superquadric.from_flat(state.add(truth.to_flat(), error))
+    (found,) = one.follow([Seen(turned, state.scale_sizes(covariance, truth.size))], 0.1, is_pose_known=False)
     assert angle_between(found.superquadric, truth) == pytest.approx(shown, abs=0.02)
     np.testing.assert_allclose(found.superquadric.size, truth.size)
 

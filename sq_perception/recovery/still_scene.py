@@ -5,6 +5,10 @@ makes of it, which is its covariance.  So the body of the frame before stands, w
 or fit.  It is not refined either: its error is that of the frame it was recovered from, and counts once
 (:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
 
+    scene = StillScene(recoverer)
+    for depth in video:
+        found = scene.recover(depth, camera)
+
 Equation
 --------
 q = (d - r) / (s z^2) compares a pixel's depth d with its depth r when its body was recovered; s is the noise of the
@@ -31,6 +35,7 @@ IEEE PAMI 15(1), 1993, for the change of a range image under motion.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -44,8 +49,10 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.imaging.regions import window as window_of
 from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference
+from sq_perception.recovery.recoverer import Readings, Recoverer
+from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.segmentation.segments import Segmentation
 
 _WIDTH = 320
 """Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
@@ -82,6 +89,31 @@ _ALIKE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
+class Reference:
+    """A frame's recovery, and what it was made from: what the next frame is compared with.
+
+    Attributes
+    ----------
+    recovery
+        What the frame came to.
+    depth : float32 (rows, columns)
+        Every ``stride``-th pixel of the image, 0 where nothing was measured: for each body, as it was when that was
+        recovered.
+    segmentation
+        The objects, of all pixels, found ``age`` frames ago, or ``given``.
+    """
+
+    recovery: FrameRecovery
+    depth: np.ndarray
+    stride: int
+    camera: Camera
+    options: RecoveryOptions
+    segmentation: Segmentation
+    age: int
+    given: bool
+
+
+@dataclass(frozen=True, eq=False)
 class Repeated:
     """What a frame repeats of the frame before.
 
@@ -89,43 +121,86 @@ class Repeated:
     ----------
     bodies
         Bodies that still hold, by their label in the frame before.
-    reference
-        The reference of the frame before, a frame older, where its segments repeat; None where they have to be found.
+    segmentation
+        That of the frame before, where its segments repeat; None where they have to be found.
     """
 
     bodies: Mapping[int, Recovery]
-    reference: Reference | None
+    segmentation: Segmentation | None
 
 
 NOTHING = Repeated({}, None)
 
 
-def repeated(
-    previous: FrameRecovery | None,
-    depth: np.ndarray,
-    camera: Camera,
-    options: RecoveryOptions,
-    labels: np.ndarray | None = None,
-) -> Repeated:
-    """The bodies and segments of the frame before that hold for an image; nothing without such a frame.
+class StillScene:
+    """Recovers the frames of one camera, and takes from the frame before what did not change.
 
     Parameters
     ----------
-    depth : float (height, width)
-        Metres, NaN where nothing was measured.
-    labels : integer (height, width), optional
-        Masks that were given for the image: segments repeat only where these do, or where none were given to either.
+    recoverer
+        What recovers the rest; several scenes may share it.
+    last
+        What to compare the first frame with, if there is something.
     """
-    before = None if previous is None else previous.reference
-    if previous is None or before is None:
-        return NOTHING
-    if before.camera != camera or before.options != options or not camera.is_pinhole:
+
+    def __init__(self, recoverer: Recoverer, last: Reference | None = None) -> None:
+        self.recoverer = recoverer
+        self.last = last
+
+    def recover(
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        labels: np.ndarray | None = None,
+        options: RecoveryOptions | None = None,
+    ) -> FrameRecovery:
+        """Recover every object of the next frame; parameters and errors as those of :meth:`Recoverer.recover`."""
+        self.last = follow(self.recoverer, self.recoverer.read(depth, camera, labels, options), self.last)
+        return self.last.recovery
+
+
+def follow(recoverer: Recoverer, readings: Readings, last: Reference | None) -> Reference:
+    """Recover a frame, given the reference that the frame before left; returns what it leaves to the next."""
+    kept = NOTHING if last is None else repeated(last, readings)
+    seen, stride = sampled(readings.depth, readings.camera)
+    if last is not None and kept.segmentation is not None and len(kept.bodies) == len(last.recovery.bodies):
+        bodies = tuple(replace(body, repeats=body.repeats + 1) for body in last.recovery.bodies)
+        spent = 1e3 * (time.perf_counter() - readings.began)
+        milliseconds = {**dict.fromkeys(last.recovery.milliseconds, 0.0), "segmentation": spent, "total": spent}
+        return replace(
+            last, recovery=replace(last.recovery, bodies=bodies, milliseconds=milliseconds), age=last.age + 1
+        )
+    found = recoverer.find_objects(readings, kept.segmentation)
+    same = {} if last is None else matched(kept, last.recovery.labels, found.objects)
+    recovery = recoverer.recover_objects(readings, found, same)
+    age = 0 if last is None or kept.segmentation is None else last.age + 1
+    new = Reference(
+        recovery, seen, stride, readings.camera, readings.options, found.segmentation, age, readings.labels is not None
+    )
+    return new if last is None or not same else mixed(new, last, list(same))
+
+
+def warm_up() -> None:
+    """Compile, or load from disk, every kernel by two images of two readings."""
+    old, near = np.full((2 * _BLOCK, 2 * _BLOCK), np.float32(1)), np.ones((2 * _BLOCK, 2 * _BLOCK), np.uint8)
+    change, _ = _changed(old, old, 2.0)
+    _in_noise_levels(change, old, old, 1e-3, 2.0)
+    _moments(near, 1e-3, change, old, old, old)
+
+
+def repeated(last: Reference, readings: Readings) -> Repeated:
+    """The bodies and segments of the frame before that hold for an image.
+
+    Segments repeat only where given masks do, or where none were given to either.
+    """
+    previous, camera, labels = last.recovery, readings.camera, readings.labels
+    if last.camera != camera or last.options != readings.options or not camera.is_pinhole:
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new = before.depth, sampled(depth, camera)[0]
-    shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
-    compared = _compared(old, new, shown, before.segments.sigma)
+    old, new = last.depth, sampled(readings.depth, camera)[0]
+    shown = np.ascontiguousarray(previous.labels[:: last.stride, :: last.stride], dtype=np.int32)
+    compared = _compared(old, new, shown, last.segmentation.sigma)
     if compared is None:
         return NOTHING
     change, patches, level, share = compared
@@ -150,10 +225,10 @@ def repeated(
             if body is not due and CUT_SHORT not in body.message:
                 kept[body.label] = body
     count = len(previous.bodies)
-    is_same = not before.given if labels is None else np.array_equal(labels, previous.labels)
-    is_fresh = len(kept) == count or before.age < _OLD
+    is_same = not last.given if labels is None else np.array_equal(labels, previous.labels)
+    is_fresh = len(kept) == count or last.age < _OLD
     repeats = is_same and still and 0 < count == repeating and is_fresh
-    return Repeated(kept, replace(before, age=before.age + 1) if repeats else None)
+    return Repeated(kept, last.segmentation if repeats else None)
 
 
 def _compared(
@@ -202,11 +277,11 @@ def sampled(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
     return np.where(np.isnan(seen), np.float32(0), seen), stride
 
 
-def mixed(new: Reference, old: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
-    """The new readings, but the old ones around the labels that were recovered from these."""
-    taken = np.zeros(new.depth.shape, bool)
+def mixed(new: Reference, old: Reference, kept: Sequence[int]) -> Reference:
+    """The new reference, with the old readings around the labels that were recovered from these."""
+    labels, taken = new.recovery.labels[:: new.stride, :: new.stride], np.zeros(new.depth.shape, bool)
     for label in kept:
-        taken |= _around(labels[:: new.stride, :: new.stride] == label) > 0
+        taken |= _around(labels == label) > 0
     return replace(new, depth=np.where(taken, old.depth, new.depth))
 
 

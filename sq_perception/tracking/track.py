@@ -1,4 +1,4 @@
-"""What is kept of one track from frame to frame, how it is predicted, and what of it is published.
+"""A track: what is known of one body between frames, its prediction, and what a consumer gets of it.
 
 Metres, radians, seconds; world frame; state and covariance as in :mod:`~sq_perception.tracking.state`.
 """
@@ -13,7 +13,7 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.tracking import state as states
-from sq_perception.tracking.fusion import Views
+from sq_perception.tracking.fusion import Estimate
 from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN
 
 DRIFT = states.diagonal(0.0, 0.0, 0.001, 0.01)
@@ -22,14 +22,10 @@ CONFIRM_AFTER = 3
 """Observations until a track is confirmed: one more than may disagree by chance.  Chosen."""
 FORGET_POSE_AFTER = 5.0
 """Seconds without observation until a body may be anywhere within reach.  Chosen."""
-_MOTION_SHARE = 0.5
-"""Standard deviation of a predicted motion, as a share of it: hands speed up and stop.  Chosen."""
-_MOVING_TURN = 0.3
-"""Radians in a second that a moving body may turn, standard deviation.  Chosen."""
+HAND = 1.0
+"""Metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down."""
 _COASTING = 1.0
-"""Seconds: so long an unseen body is taken to go on as it was seen to move.  Chosen."""
-_UNPLACED = 1.0
-"""Metres and radians: deviation of a pose that is forgotten, farther than things are carried."""
+"""Seconds that an unseen body is taken to go on as it was seen to move.  Chosen."""
 
 
 class TrackState(Enum):
@@ -65,9 +61,9 @@ class Track:
     observation
         Index of this frame's observation; None if there is none.
     follows
-        Whether the body is as this frame observed it.  False where there is none, for one whose centre or
-        rotation is elsewhere and which the track does not believe yet, and for one of other sizes or exponents if it is
-        not the first in a row.
+        Whether the body is as this frame observed it.  False where there is no observation, where its centre or
+        rotation is elsewhere and the track does not believe it yet, and where its sizes or exponents disagree for
+        more than one frame.
     """
 
     id: int
@@ -83,87 +79,79 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """One track.
+    """What is kept of one track.
 
     Attributes
     ----------
-    id
-        The id of the track.
-    state : (12,)
-    covariance : (11, 11)
-        P, without ``lasting``.
-    lasting : (11, 11)
-        M: of the error that all views have in common.
-    views : Views
-    last
-        Stamp of the last observation.
-    agreed
-        Stamp of the last one that the centre follows.
-    velocity : (3,)
-    seen, missed
-        Number of observations, and of frames in a row since that should have shown it.
-    disagreed, strayed : (11,)
+    id, velocity, seen, observation
+        As in :class:`Track`.
+    estimate : Estimate
+    last, agreed
+        Stamps of the last observation, and of the last one that the centre follows.
+    missed
+        Frames in a row, since the last observation, that should have shown it.
+    disagreed, last_error : (11,)
         Observations in a row that disagreed, and the error of the last one if it did.
     jumps
         Observations in a row that were found elsewhere.
-    observation
-        Index of this frame's observation, None if there is none.
     follows
         Whether the state is as the last observation has it.
     answer : (12,) or None
-        What the last observation was, if it is an old one and shows no more than that the body is still there.
+        The last observation, if it is an old answer that shows no more than that the body is still there.
     """
 
     id: int
-    state: np.ndarray
-    covariance: np.ndarray
-    lasting: np.ndarray
-    views: Views
+    estimate: Estimate
     last: float
     agreed: float
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
     seen: int = 1
     missed: int = 0
     disagreed: int = 0
-    strayed: np.ndarray = field(default_factory=lambda: np.zeros(LENGTH))
+    last_error: np.ndarray = field(default_factory=lambda: np.zeros(LENGTH))
     jumps: int = 0
     observation: int | None = None
-    follows: bool = False
+    follows: bool = True
     answer: np.ndarray | None = None
 
     @property
     def is_moving(self) -> bool:
         return bool(self.velocity.any())
 
-    def predicted(self, elapsed: float, stamp: float) -> Body:
-        """The body at a stamp, so many seconds after the frame before; not observed."""
-        variance, after = np.diag(DRIFT) * elapsed, self.state
-        velocity = np.zeros(3) if stamp - self.last > _COASTING else self.velocity
+    def predict(self, elapsed: float, stamp: float) -> Body:
+        """The body at a stamp, ``elapsed`` seconds after the frame before; not observed."""
+        variance, estimate = np.diag(DRIFT) * elapsed, self.estimate
+        state, velocity = estimate.state.copy(), self.velocity
+        if stamp - self.last > _COASTING:
+            velocity = np.zeros(3)
         if velocity.any():
             step = velocity * elapsed
-            after = after.copy()
-            after[5:8] += step
-            variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
-            variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
+            state[5:8] += step
+            variance[CENTRE] += step @ step  # hands speed up and stop
+            variance[TURN] += HAND**2 * min(elapsed, 1.0)
         if stamp - self.last > FORGET_POSE_AFTER:
             # Once: however many frames pass meanwhile, it cannot be forgotten more.
-            variance[POSE] += np.maximum(_UNPLACED**2 - np.diag(self.covariance)[POSE], 0.0)
-        covariance = self.covariance + np.diag(variance)
-        answer = self.answer if self.observation is not None else None
-        return replace(self, state=after, covariance=covariance, velocity=velocity, observation=None, answer=answer)
+            variance[POSE] += np.maximum(HAND**2 - np.diag(estimate.covariance)[POSE], 0.0)
+        return replace(
+            self,
+            estimate=estimate._replace(state=state, covariance=estimate.covariance + np.diag(variance)),
+            velocity=velocity,
+            observation=None,
+            answer=self.answer if self.observation is not None else None,
+        )
 
-    def still_there(self, index: int, answer: np.ndarray, stamp: float) -> Body:
-        """The body after an old observation, one of this index in its frame."""
+    def see_again(self, index: int, answer: np.ndarray, stamp: float) -> Body:
+        """The body after an old answer, the observation of this index."""
         agreed = stamp if self.follows else self.agreed
         return replace(self, seen=self.seen + 1, missed=0, last=stamp, agreed=agreed, observation=index, answer=answer)
 
-    def published(self) -> Track:
+    def publish(self) -> Track:
         """What a consumer gets."""
-        covariance = self.covariance + self.lasting @ self.lasting.T
+        covariance = self.estimate.total
         known = TrackState.CONFIRMED if self.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
         return Track(
             id=self.id,
-            superquadric=Superquadric.from_flat(self.state.copy()),
+            superquadric=Superquadric.from_flat(self.estimate.state.copy()),
             sigma_size=np.sqrt(np.diag(covariance)[0:3]),
             covariance=covariance,
             velocity=self.velocity.copy(),
@@ -174,6 +162,9 @@ class Body:
         )
 
 
-def stacked(some: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
-    """States (n, 12) and covariances (n, 11, 11)."""
-    return np.array([body.state for body in some]), np.array([body.covariance for body in some])
+def stack(some: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 12) and covariances P (n, 11, 11)."""
+    return (
+        np.array([body.estimate.state for body in some]).reshape(-1, 12),
+        np.array([body.estimate.covariance for body in some]).reshape(-1, LENGTH, LENGTH),
+    )

@@ -1,0 +1,88 @@
+"""The node of ``sq-perception demo``: collects images, their true bodies, and what two nodes find in them."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import Image, PointCloud2
+
+from sq_msgs_py.depth_image import depth_from_message
+from sq_msgs_py.superquadrics import from_message
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.nodes.frame import stamp_of
+from sq_perception.recordings.publication import superquadrics
+
+IMAGE, TRUTH = "depth/image", "synthetic_depth_node/truth"
+_REMEMBERED = 40
+"""Images that wait for what belongs to them."""
+_PATIENCE = 600.0
+"""Seconds until the first result: the first start compiles, for minutes on a slow machine."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image: its depth (height, width), metres, its true bodies (n,), and by node what was found (m,) and after how
+    many milliseconds."""
+
+    depth: np.ndarray
+    truth: Superquadric
+    found: Mapping[str, Superquadric]
+    delay: Mapping[str, float]
+
+
+class DemoNode(Node):
+    """Ends the process, as Ctrl-C does, ``seconds`` after the first image that all of ``nodes`` have answered.
+
+    Attributes
+    ----------
+    shots : list of Shot
+        The images that all have answered.
+    """
+
+    def __init__(self, name: str, nodes: tuple[str, ...], seconds: float) -> None:
+        super().__init__(name)
+        self.start_failure = ""
+        self.shots: list[Shot] = []
+        self._nodes, self._seconds, self._due = nodes, seconds, time.monotonic() + _PATIENCE
+        self._waiting: OrderedDict[int, dict[str, tuple[Any, float]]] = OrderedDict()
+        fast = QoSProfile(depth=5, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+        self.create_subscription(Image, IMAGE, partial(self._on_message, IMAGE), fast)
+        self.create_subscription(PointCloud2, TRUTH, partial(self._on_message, TRUTH), fast)
+        for node in nodes:
+            self.create_subscription(PointCloud2, f"{node}/superquadrics", partial(self._on_message, node), 10)
+        self.create_timer(0.1, self._look_at_clock)
+
+    def close(self) -> bool:
+        """There is nothing to wait for."""
+        return True
+
+    def _look_at_clock(self) -> None:
+        if time.monotonic() > self._due:
+            if self.shots:
+                signal.raise_signal(signal.SIGINT)
+            else:
+                self.start_failure = f"no image was answered by all of {', '.join(self._nodes)} in {_PATIENCE:g} s"
+
+    def _on_message(self, name: str, message: Any) -> None:
+        stamp = stamp_of(message)
+        parts = self._waiting.setdefault(stamp, {})
+        parts[name] = message, 1e-6 * (time.time_ns() - stamp)
+        while len(self._waiting) > _REMEMBERED:
+            self._waiting.popitem(last=False)
+        if parts.keys() != {IMAGE, TRUTH, *self._nodes}:
+            return
+        if not self.shots:
+            self._due = time.monotonic() + self._seconds
+        bodies = {each: superquadrics(from_message(parts[each][0]).recovered) for each in (TRUTH, *self._nodes)}
+        delay = {each: parts[each][1] for each in self._nodes}
+        self.shots.append(Shot(depth_from_message(parts[IMAGE][0]), bodies.pop(TRUTH), bodies, delay))
+        del self._waiting[stamp]

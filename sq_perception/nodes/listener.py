@@ -1,0 +1,179 @@
+"""A subscription that is as reliable as the publishers of its topic let it be, and that says whom it hears.
+
+Keep last 1.  Best effort hears every publisher, but large messages that do not fit into the publisher's shared memory
+are lost: of VGA depth images, four in five.  A reliable subscription loses none, but does not hear a publisher that is
+best effort.  So a listener is reliable while all publishers of its topic are, and best effort otherwise; it looks again
+when one comes or goes.  DDS cannot change a live subscription: another one takes its place, and both listen while the
+publishers find it, so that no message is lost; one that both hear is passed on once.  Where
+``qos_overrides.<topic>.subscription.reliability`` is reliable or best_effort, that is kept.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from time import monotonic
+from typing import Any
+
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSProfile, QoSReliabilityPolicy, qos_check_compatible
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from sq_perception.nodes import fast_dds
+from sq_perception.nodes.frame import newest, stamp_of
+from sq_perception.nodes.statistics import THROTTLE, Statistics
+
+_RELIABILITIES = {
+    "best_available": None,
+    "reliable": QoSReliabilityPolicy.RELIABLE,
+    "best_effort": QoSReliabilityPolicy.BEST_EFFORT,
+}
+"""What the override may be, as rmw names it; None follows the publishers."""
+_OVERLAP = 1.0
+"""Seconds for which a subscription outlives its replacement, which a publisher may find late."""
+_REMEMBERED = 8
+"""Messages that are remembered meanwhile: more than are on their way at once."""
+
+
+class Listener:
+    """One subscription; ``statistics`` count what is lost.  Call :meth:`follow` each second.
+
+    Raises
+    ------
+    ValueError
+        For an override that is no reliability.
+    """
+
+    def __init__(
+        self, node: Node, kind: type[Any], topic: str, callback: Callable[[Any], None], statistics: Statistics
+    ) -> None:
+        self._node, self._kind, self._callback, self._statistics = node, kind, callback, statistics
+        # Kept: of a subscription that another thread destroys meanwhile not even the name can be asked.
+        self.topic = str(node.resolve_topic_name(topic))
+        """The resolved name."""
+        self._asked = _reliability_override(node, self.topic)
+        self._heard: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        """Stamps of the last messages, and which subscription heard them."""
+        self._count, self._since = 0, 0.0
+        """How many subscriptions there have been, and when the last one was made."""
+        self._lock = threading.Lock()
+        """Guards the subscriptions: they are replaced in the executor's thread and closed in another one."""
+        self._subscriptions: list[Subscription] = []
+        """The present one last; before it one that it replaces."""
+        with self._lock:
+            self._subscribe(self._wanted_reliability())
+
+    @property
+    def qos(self) -> QoSProfile:
+        """Quality of service of the present subscription."""
+        return self._qos
+
+    @property
+    def publishers(self) -> str:
+        """Who publishes the topic, with which quality of service, and who of them cannot be heard."""
+        parts = []
+        for publisher in self._node.get_publishers_info_by_topic(self.topic):
+            offered = publisher.qos_profile
+            verdict, why = qos_check_compatible(offered, self._qos)
+            kinds = ", ".join(one.name.lower().replace("_", " ") for one in (offered.reliability, offered.durability))
+            note = f"; INCOMPATIBLE: {why.strip().rstrip(';')}" if verdict == QoSCompatibility.ERROR else ""
+            name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+            parts.append(f"{name} ({publisher.topic_type}, {kinds}{note})")
+        count = len(parts)
+        return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"
+
+    def follow(self) -> None:
+        """Subscribe as the publishers offer now, and end the subscription that was replaced some time ago."""
+        with self._lock:
+            if len(self._subscriptions) > 1 and monotonic() - self._since > _OVERLAP:
+                self._node.destroy_subscription(self._subscriptions.pop(0))
+        self._follow_publishers()
+
+    def close(self) -> None:
+        """Listen no more."""
+        with self._lock:
+            for subscription in self._subscriptions:
+                self._node.destroy_subscription(subscription)
+            self._subscriptions = []
+
+    def _follow_publishers(self) -> None:
+        wanted = self._wanted_reliability()
+        with self._lock:
+            if len(self._subscriptions) == 1 and wanted != self._qos.reliability:
+                self._subscribe(wanted)
+
+    def _wanted_reliability(self) -> QoSReliabilityPolicy:
+        if self._asked is not None:
+            return self._asked
+        offered = {one.qos_profile.reliability for one in self._node.get_publishers_info_by_topic(self.topic)}
+        reliable = QoSReliabilityPolicy.RELIABLE
+        return reliable if offered == {reliable} else QoSReliabilityPolicy.BEST_EFFORT
+
+    def _subscribe(self, reliability: QoSReliabilityPolicy) -> None:
+        self._count, self._since = self._count + 1, monotonic()
+        self._heard.clear()
+        self._qos = newest()
+        self._qos.reliability = reliability
+        events = SubscriptionEventCallbacks(
+            matched=lambda _: self._follow_publishers(),
+            incompatible_qos=lambda _: self._on_incompatible(),
+            message_lost=lambda event: self._on_lost(event.total_count, event.total_count_change),
+        )
+        overridable = QoSOverridingOptions(policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH))
+        made = self._node.create_subscription(
+            self._kind,
+            self.topic,
+            partial(self._on_message, self._count),
+            self._qos,  # rclpy writes the overrides into it
+            event_callbacks=events,
+            qos_overriding_options=overridable,
+        )
+        self._subscriptions.append(made)
+
+    def _on_message(self, number: int, message: Any) -> None:
+        if len(self._subscriptions) > 1 and (stamp := stamp_of(message)):
+            if any(known == stamp and by != number for known, by in self._heard):
+                return
+            self._heard.append((stamp, number))
+        self._callback(message)
+
+    def _on_incompatible(self) -> None:
+        if self._asked is None:
+            self._follow_publishers()
+        else:
+            self._node.get_logger().warning(f"{self.topic}: {self.publishers}", throttle_duration_sec=THROTTLE)
+
+    def _on_lost(self, total: int, new: int) -> None:
+        self._statistics.lose(self.topic, new)
+        if self._qos.reliability == QoSReliabilityPolicy.BEST_EFFORT:
+            remedy = (
+                "best effort messages that do not fit into the shared memory which Fast DDS reserves are lost. Make "
+                "the PUBLISHER (the camera driver) reliable, or start it with "
+                f"{fast_dds.VARIABLE}={fast_dds.profile_path()}"
+            )
+        else:
+            remedy = (
+                "a reliable publisher's queue was full before they were delivered. Raise the depth of the PUBLISHER "
+                f"(the camera driver), or set qos_overrides.{self.topic}.subscription.reliability to best_effort"
+            )
+        text = f"{total} messages of {self.topic} lost before they arrived: {remedy}"
+        self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE)
+
+
+def _reliability_override(node: Node, topic: str) -> QoSReliabilityPolicy | None:
+    """The user's choice for a topic.  Not by rclpy's own override, which does not tell it from the default."""
+    name = f"qos_overrides.{topic}.subscription.reliability"
+    if not node.has_parameter(name):
+        about = ParameterDescriptor(
+            description=f"{', '.join(_RELIABILITIES)}; the first one follows the publishers", read_only=True
+        )
+        node.declare_parameter(name, "best_available", about)
+    given = str(node.get_parameter(name).value)
+    if given not in _RELIABILITIES:
+        raise ValueError(f"{name}: expected one of {', '.join(_RELIABILITIES)}, got {given}")
+    return _RELIABILITIES[given]

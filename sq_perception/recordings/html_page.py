@@ -1,0 +1,140 @@
+"""Results of recorded frames as one HTML file: points, bodies and numbers, for any browser, without a server.
+
+The file is complete in itself: its script draws with WebGL, and its content security policy forbids the browser to load
+anything.  A frame is one line of JSON, which grows the file as the run goes; bodies are written as their parameters and
+meshed by the page.  Everything that is drawn is in metres in the optical frame; the numbers are those of the other
+results.
+
+Points are quantised to 16 bits along each axis of the box around them: 0.1 mm in a scene of six metres.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sq_perception.files.output_file import OutputFile, named
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.mesh import COLOURS
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recordings.frame_file import RecordedFrame
+from sq_perception.recordings.result_json import in_result_frame
+from sq_perception.recovery.recovery import FrameRecovery, edges_as_text, place_as_text
+
+_MOST_POINTS = 40000
+_SIGMAS = 2.0
+"""Standard deviations between a body and its shell."""
+_LARGEST_SHELL = 3.0
+"""Half sizes of a shell over those of its body, at most: one that is hardly known would hide the rest."""
+_TITLES = ("body", "status", "full edges", "centre", "exponents", "score", "why")
+_TEMPLATE = Path(__file__).with_name("html_page.html")
+
+
+class HtmlPage:
+    """One file, which takes its name when it is closed; raises OSError where it cannot be written."""
+
+    def __init__(self, path: str | Path) -> None:
+        self._output = OutputFile(path)
+        self._file = self._output.partial.open("w", encoding="utf-8")
+        self._count = 0
+        self._beginning, self._end = _TEMPLATE.read_text(encoding="utf-8").split("<!-- frames -->\n")
+
+    def add(self, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+        """Write a frame and what was recovered from it."""
+        content = {"name": f"{self._count}: {frame.name}", **_scene(frame, recovery), **_numbers(frame, recovery)}
+        # Without "<" no text in it can end the script.
+        text = json.dumps(content, allow_nan=False).replace("<", "\\u003c")
+        with named(self._output.path):
+            self._file.write(f"{'' if self._count else self._beginning}<script>frames.push({text});</script>\n")
+        self._count += 1
+
+    def close(self, whole: bool = True) -> Path | None:
+        """Finish the file; where it is, None without a frame.  See :meth:`OutputFile.commit`."""
+        if self._file.closed:
+            return None
+        try:
+            with named(self._output.path):
+                with self._file:
+                    self._file.write(self._end)
+                return self._output.commit(whole) if self._count else None
+        finally:
+            self._output.discard()
+
+
+def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
+    """What the page draws of a frame, and from where it looks at it."""
+    camera, depth = frame.camera, frame.depth
+    stride = max(1, math.ceil(math.sqrt(depth.size / _MOST_POINTS)))
+    rows, columns = np.nonzero(np.isfinite(depth[::stride, ::stride]))
+    rows, columns = stride * rows, stride * columns
+    points = camera.unproject(columns, rows, depth[rows, columns]).astype(float)
+    numbers = np.zeros(int(recovery.labels.max(initial=0)) + 1, np.uint16)
+    bodies = []
+    up = np.array([0.0, -1.0, 0.0]) if recovery.plane is None else recovery.plane[:3]
+    for k, body in enumerate(recovery.bodies):
+        if 0 <= body.label < len(numbers):
+            numbers[body.label] = k + 1
+        if body.status != Status.FAILED:
+            bodies.append(_body(k, body.superquadric, body.sigma_size, up))
+    low = points.min(axis=0) if len(points) else np.zeros(3)
+    step = np.maximum((points.max(axis=0) if len(points) else low) - low, 1e-9) / np.iinfo(np.uint16).max
+    middle = np.median(points, axis=0) if len(points) else np.array([0.0, 0.0, 1.0])
+    if bodies:
+        middle = np.mean([body["translation"] for body in bodies], axis=0)
+    pixel = (float(middle[2]) if camera.is_pinhole else 1.0) / min(camera.fx, camera.fy)
+    return {
+        "points": {
+            "low": low.tolist(),
+            "step": step.tolist(),
+            "steps": _packed(np.rint((points - low) / step)),
+            "bodies": _packed(numbers[np.maximum(recovery.labels[rows, columns], 0)]),
+        },
+        "bodies": bodies,
+        "colours": COLOURS[np.arange(len(recovery.bodies)) % len(COLOURS)].tolist(),
+        "middle": middle.tolist(),
+        "up": up.tolist(),
+        "dot": 0.7 * stride * pixel,
+        "field": 2 * math.atan(0.5 * camera.height / camera.fy) if camera.is_pinhole else 0.0,
+        "aspect": camera.width / camera.height * camera.fy / camera.fx,
+    }
+
+
+def _body(number: int, body: Superquadric, sigma_size: np.ndarray, up: np.ndarray) -> dict[str, Any]:
+    """The parameters of a body, the half sizes of its shell where they are known, and how far up its label stands."""
+    sigma = np.nan_to_num(sigma_size, posinf=np.inf)
+    outer = np.minimum(body.size + _SIGMAS * sigma, _LARGEST_SHELL * body.size)
+    return {
+        "number": number,
+        **{name: np.asarray(getattr(body, name)).tolist() for name in ("size", "shape", "translation", "rotation")},
+        "outer": outer.tolist() if (sigma > 0).any() else None,
+        "height": float(body.support(up[None])[0]),
+    }
+
+
+def _packed(values: np.ndarray) -> str:
+    """Numbers as base64 of unsigned 16 bit, little endian."""
+    return base64.b64encode(values.astype("<u2").tobytes()).decode()
+
+
+def _numbers(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
+    """The bodies as rows of text, and what is to be said of the frame."""
+    rows = []
+    for body in recovery.bodies:
+        shown = in_result_frame(body.superquadric, frame.is_cube)
+        is_failed = body.status == Status.FAILED
+        rows.append(
+            [
+                body.status.name.lower(),
+                "" if is_failed else edges_as_text(shown.size, body.sigma_size, frame.is_cube),
+                place_as_text(shown.translation, frame.is_cube),
+                "" if is_failed else " ".join(f"{value:.2f}" for value in shown.shape),
+                f"{body.score:.2f}" if math.isfinite(body.score) else "",
+                "" if body.status == Status.CONVERGED else body.message,
+            ]
+        )
+    return {"remark": recovery.message, "titles": _TITLES, "rows": rows}

@@ -1,0 +1,106 @@
+"""Nodes as child processes: started together, watched, and stopped without leftovers.
+
+Every child leads a process group of its own and imports the very package that the parent runs from, installed or source
+tree, whatever the working directory.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+import sq_perception
+
+_PATIENCE = 8.0
+"""Seconds for all children together to end after an interrupt: a lifecycle node waits 4 s for its transition."""
+_TAIL = 2**14
+"""Bytes of a node's output that are looked at."""
+_ROOT = str(Path(sq_perception.__file__).resolve().parent.parent)
+_CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import executables as e; sys.exit(e.{node}())"
+
+
+class Child(subprocess.Popen[bytes]):
+    """One running node of :mod:`sq_perception.nodes.executables`; the environment is this process's if not given."""
+
+    def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+        self.name = node
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
+        super().__init__(
+            command(node, arguments),
+            env={**(os.environ if environment is None else environment), "PYTHONUNBUFFERED": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=self._output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self.poll()
+
+    def last_lines(self) -> list[str]:
+        """The last lines of its standard output and error."""
+        number = self._output.fileno()
+        tail = os.pread(number, _TAIL, max(0, os.fstat(number).st_size - _TAIL))
+        return tail.decode(errors="replace").splitlines()[-15:]
+
+    def interrupt(self) -> None:
+        """Interrupt it and all that it started, as Ctrl-C does."""
+        self.send_signal(signal.SIGINT)
+
+    def kill(self) -> None:
+        """End it and all that it started."""
+        self.send_signal(signal.SIGKILL)
+        self.wait()
+
+    def send_signal(self, sig: int) -> None:
+        """Send a signal to the process group that it leads, if it still runs."""
+        if self.exit_code is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self.pid, sig)
+
+    def close(self) -> None:
+        """Forget what it said; for one that has ended."""
+        self._output.close()
+
+
+class Children:
+    """Nodes that live as long as a ``with`` block."""
+
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
+        self._environment = environment
+        self._running: list[Child] = []
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Interrupt all, wait, and kill those that go on."""
+        for child in self._running:
+            child.interrupt()
+        deadline = time.monotonic() + _PATIENCE
+        for child in self._running:
+            try:
+                child.wait(max(deadline - time.monotonic(), 0.0))
+            except subprocess.TimeoutExpired:
+                child.kill()
+            child.close()
+
+    def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
+        """Start one node."""
+        child = Child(node, arguments, self._environment)
+        self._running.append(child)
+        return child
+
+
+def command(node: str, arguments: Sequence[str] = ()) -> list[str]:
+    """The command line that runs a node by this interpreter, from this package."""
+    return [sys.executable, "-c", _CODE.format(root=_ROOT, node=node), *arguments]

@@ -1,0 +1,67 @@
+"""The programs of ros2 run: help, words that they do not take, and a Ctrl-C while Python still imports."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from sq_perception.nodes.executables import PROGRAMS
+
+
+def run(name: str, *arguments: str, before: str = "", after: str = "") -> subprocess.CompletedProcess[str]:
+    """A program, as the script that pip makes for it starts it, with code before and after the import."""
+    code = f"import sys; sys.argv[0] = '/somewhere/bin/{name}'\n{before}\n"
+    code += f"from sq_perception.nodes.executables import {name}\n{after}\nsys.exit({name}())"
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_help_tells_topics_and_parameters_without_ros(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    done = run(name, "--help", before="sys.modules['rclpy'] = None")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"usage: ros2 run sq_perception {name}" in done.stdout
+    assert "--params-file FILE" in done.stdout
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    from sq_perception.nodes.parameters import KINDS
+
+    for one in fields(KINDS[name.replace("recover_cameras", "recover_node")]):
+        assert f"\n    {one.name}: " in done.stdout
+
+
+def test_a_word_that_is_not_for_ros_is_refused() -> None:
+    """As by who forgets --ros-args: the parameter would have been ignored without a word."""
+    done = run("recover_node", "-p", "model:=mine.safetensors")
+    assert done.returncode == 2
+    assert "unrecognized arguments: -p model:=mine.safetensors" in done.stderr
+
+
+INTERRUPT = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
+DURING = f"""
+class Hook:
+    def find_spec(self, name, path=None, target=None):
+        if name == "sq_perception.nodes.process":
+            {INTERRUPT}
+sys.meta_path.insert(0, Hook())
+"""
+
+
+@pytest.mark.parametrize("moment", [{"before": DURING}, {"after": INTERRUPT}], ids=["importing", "imported"])
+def test_ctrl_c_before_the_start_leaves_no_traceback(moment: dict[str, str]) -> None:
+    done = run("recover_node", **moment)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_only_the_programs_give_ctrl_c_another_meaning() -> None:
+    code = "import signal, sq_perception.nodes.executables as e; print(signal.getsignal(signal.SIGINT).__name__)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "default_int_handler\n"
+
+
+def test_setup_installs_these_programs(repository: Path) -> None:
+    assert {path.name for path in (repository / "resource" / "ros2_run").iterdir()} == set(PROGRAMS)
