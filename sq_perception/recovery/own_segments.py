@@ -61,9 +61,6 @@ _LEAST_TO_PART = 60
 """Cells of a segment that may be parted: 15 in a piece."""
 _LEAST_CELLS = 4
 """Cells that another segment has in a view at least, for a mean over them."""
-_MOST_STRAYS = 0.5
-"""Share of a segment beyond which the network contradicts itself, as the object is what most of the segment shows: the
-segment keeps its pixels, if it is not dropped."""
 _ROUNDS = 3
 """Rounds of joining: eight pieces may become one."""
 _BRUSH = np.ones((7, 7), np.uint8)
@@ -368,8 +365,11 @@ def _logits(answer: _Seen) -> np.ndarray:
 
 
 def _strays(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
-    """The pixels of a segment that are not its object's own; none of one that has next to no other pixels."""
+    """The pixels of a segment that are not its object's own.
+
+    None where they are most of it, as the object is what most of the segment shows, or nearly all.
+    """
     own = inside & (logits >= 0)
     count = np.count_nonzero(own)
-    contradicts = count < (1 - _MOST_STRAYS) * np.count_nonzero(inside) or count < MIN_PIXELS
+    contradicts = 2 * count < np.count_nonzero(inside) or count < MIN_PIXELS
     return np.zeros_like(inside) if contradicts else inside & ~own
