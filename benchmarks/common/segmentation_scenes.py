@@ -29,6 +29,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import moved
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
+from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.thing import NO_CAVITY
@@ -67,7 +68,7 @@ def scene(kind: str, seed: int) -> SegmentationScene:
     sensor = "random"
     if rng.random() < _RANDOM_SENSOR:
         seen = labels > 0 if labels.any() else np.ones(labels.shape, bool)
-        measured = thing_sensing.measured_by_any(depth, seen, camera, rng)
+        measured = thing_sensing.measured_by_any(depth, seen, camera, Stages(), rng)
     else:
         sensor = str(rng.choice(list(sensor_noise.PRESETS)))
         measured = sensor_noise.preset(sensor).measured(depth, camera, rng)

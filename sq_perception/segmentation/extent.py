@@ -12,7 +12,7 @@ _SAMPLES = 400
 """Pixels of a segment, evenly taken: the 1 % that may stick out are a few still."""
 _OUTLIERS = 0.01
 """Share of the points at either end that do not count for the extent: sensors smear edges."""
-_TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)
+TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)
 """Directions (18, 2) in which edges are measured."""
 
 
@@ -33,9 +33,9 @@ def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
     if up is None:
         axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
         return float(_extents(axes.T @ points.T).max())
-    edges = _extents(np.concatenate([_TURNS @ across(up).T, up[None]]) @ points.T)
+    edges = _extents(np.concatenate([TURNS @ across(up).T, up[None]]) @ points.T)
     # A quarter turn apart, the two edges of one rectangle.
-    half = len(_TURNS) // 2
+    half = len(TURNS) // 2
     return float(max(np.maximum(edges[:half], edges[half:-1]).min(), edges[-1]))
 
 

@@ -6,9 +6,11 @@ Steps
    (:mod:`sq_perception.segmentation.support_surface`), and what is clearly above it.
 2. Components of it that no depth step cuts, taken apart where lines of sight within them cross empty space, and joined
    where none between them does (:mod:`sq_perception.segmentation.bodies`).
-3. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
+3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
+   than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
+4. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
    its surroundings sharpens (:mod:`sq_perception.recovery.own_segments`).
-4. Limits of size and place, and of number, are asked of what then remains.
+5. Limits of size and place, and of number, are asked of what then remains.
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
 Things on a higher table are found as well, those on a lower one are not.  Where no support is seen all readings are
@@ -29,7 +31,15 @@ import numpy as np
 
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import bodies, convex_parts, objectness, pieces, support_plane, support_surface
+from sq_perception.segmentation import (
+    bodies,
+    convex_parts,
+    level_faces,
+    objectness,
+    pieces,
+    support_plane,
+    support_surface,
+)
 from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
@@ -132,6 +142,9 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     relative = support.image_relative(known, camera)
     labels = bodies.above(known, camera, relative, valid, support)
     sigma = max(support.sigma, bodies.LEAST_SIGMA)
+    tops = level_faces.samples(labels, known, camera, least)
+    for face in level_faces.found(tops, labels, known, camera, support, least):
+        labels = _unloaded(labels, face, known, camera, least)
     found = _ordered(Segmentation(labels, plane.equation, (), sigma), least)
     if is_silhouette and not found.ids:
         return _without_support(known, valid, camera)
@@ -296,6 +309,18 @@ def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera) -> Se
     extents = regions.extents(found.labels)[:, [3, 1, 4, 2]]
     boxes = {k: (extents[k, 0], extents[k, 1], *(extents[k, 2:] - extents[k, :2])) for k in found.ids}
     return kept(found, {k: 1.0 for k, box in boxes.items() if _is_silhouette(valid) or not regions.fills(box, valid)})
+
+
+def _unloaded(
+    labels: np.ndarray, face: level_faces.LevelFace, known: np.ndarray, camera: Camera, least: int
+) -> np.ndarray:
+    """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
+    relative = face.surface.image_relative(known, camera)
+    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
+    parts = _ordered(Segmentation(bodies.above(known, camera, relative * valid, valid, face.surface), None, ()), least)
+    heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.surface.sigma)
+    parts = judged(replace(parts, heights=heights))
+    return np.where(parts.labels > 0, parts.labels + labels.max(), labels)
 
 
 def _ordered(found: Segmentation, least: int) -> Segmentation:

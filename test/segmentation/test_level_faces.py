@@ -1,0 +1,112 @@
+"""What stands on a carton is a thing of its own, and neither a bare carton nor a vessel falls apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from table_scenes import VGA, Table, best_iou, ious
+
+from sq_perception.segmentation import level_faces, support_plane, support_surface
+from sq_perception.segmentation.segments import segment
+from sq_perception.simulation import sensor_noise
+
+CARTON = (0.2, 0.13, 0.1)
+TOP = 2 * CARTON[2]
+EDGES = (0.05, 0.05)
+
+
+def far_table():
+    """Where things of some centimetres are low before a sensor's noise."""
+    return Table(pitch=0.75, distance=1.2)
+
+
+def sensed(table, bodies, sensor, seed):
+    depth, truth = table.see(bodies)
+    measured = sensor_noise.preset(sensor).measured(depth.astype(float), VGA, np.random.default_rng(seed))
+    return measured.astype(np.float32), truth
+
+
+@pytest.mark.parametrize("sensor", ["realsense_d435", "kinect_v1"])
+def test_small_things_on_a_carton_are_not_swallowed_by_it(sensor):
+    found = []
+    for seed in range(4):
+        table = far_table()
+        on_it = [
+            table.body(-0.06, -0.03, (0.02, 0.02, 0.015), height=TOP, turn=0.2),
+            table.body(0.06, 0.02, (0.018, 0.018, 0.025), shape=(0.1, 1.0), height=TOP),
+        ]
+        depth, truth = sensed(table, [table.body(0, 0, CARTON, EDGES, turn=0.4), *on_it], sensor, seed)
+        carton, *small = ious(truth, segment(depth, VGA).labels)
+        assert carton > 0.85
+        found += small
+    assert np.min(found) > 0.5
+    assert np.mean(found) > 0.7
+
+
+def test_a_bare_carton_stays_one():
+    table = far_table()
+    for seed in range(3):
+        depth, truth = sensed(table, [table.body(0, 0, CARTON, EDGES, turn=0.4)], "realsense_d435", seed)
+        found = segment(depth, VGA)
+        assert len(found.ids) == 1
+        assert best_iou(truth == 1, found.labels) > 0.85
+
+
+def supported(depth):
+    """The support of an image, and its depth with 0 where there is none."""
+    valid = np.isfinite(depth)
+    known = np.where(valid, depth, np.float32(0))
+    return support_surface.measured(support_plane.planes(depth, valid, VGA)[0], known, valid, VGA), known
+
+
+def faces(labels, known, support):
+    segments = level_faces.samples(labels, known, VGA, 100)
+    return level_faces.found(segments, labels, known, VGA, support, 100)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_face_is_that_of_the_carton(seed):
+    """n.p + d of the table, less the height of the carton; what stands before the carton is not under the face."""
+    table = Table(pitch=0.7, distance=1.0)
+    low, before = (0.04, 0.03, 0.015), (0.03, 0.03, 0.08)
+    bodies = [table.body(0, 0, CARTON, EDGES), table.body(0, 0, low, height=TOP), table.body(0, -0.3, before)]
+    depth, truth = table.see(bodies, 2e-3, seed)
+    labels = np.where(truth == 2, 1, truth).astype(np.int32)
+    support, known = supported(depth)
+    (face,) = faces(labels, known, support)
+    assert face.label == 1
+    assert face.surface.plane.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
+    middle = table.origin + TOP * table.plane[:3]
+    assert face.surface.plane.height(middle) == pytest.approx(0, abs=2e-3)
+    under = face.under(labels, known, VGA)
+    assert under[truth == 1].all()
+    assert not under[truth == 3].any()
+
+
+def test_the_seat_of_a_stool_is_a_face_though_it_is_the_lowest_that_is_seen_of_it():
+    table = Table(pitch=0.7, distance=1.2)
+    seat = table.body(0, 0, (0.18, 0.18, 0.015), (0.1, 1.0), height=0.42)
+    depth, truth = table.see([seat, table.body(0, 0, (0.03, 0.02, 0.015), height=0.45)], 1e-3)
+    support, known = supported(depth)
+    (face,) = faces((truth > 0).astype(np.int32), known, support)
+    assert face.surface.plane.height(table.origin + 0.45 * table.plane[:3]) == pytest.approx(0, abs=2e-3)
+
+
+def test_a_carton_without_a_load_and_a_thing_without_a_level_face_are_left_alone():
+    table = Table(pitch=0.7, distance=1.0)
+    ball = table.body(0.3, 0.0, (0.1, 0.1, 0.1), (1.0, 1.0))
+    depth, truth = table.see([table.body(-0.05, 0, CARTON, EDGES), ball], 2e-3)
+    support, known = supported(depth)
+    assert faces(truth, known, support) == []
+
+
+def test_the_bottom_of_a_vessel_is_no_face():
+    """It lies on the support, as far as the noise tells; the wall around it is no load."""
+    table = Table(pitch=1.1, distance=0.9)
+    walls = [table.body(x, y, (0.1 if y else 0.004, 0.1 if x else 0.004, 0.04)) for x, y in _SIDES]
+    depth, truth = table.see([table.body(0, 0, (0.1, 0.1, 0.006)), *walls], 2e-3)
+    support, known = supported(depth)
+    assert faces((truth > 0).astype(np.int32), known, support) == []
+
+
+_SIDES = ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1))
