@@ -29,6 +29,7 @@ sigma_e1 sigma_e2    standard deviations of the exponents
 sigma_c1..c3    standard deviations of the centre along the body's axes x y z, metres
 sigma_r1..r3    standard deviations of the rotation about the body's axes x y z, radians
 kx ky           tapers, -0.95 to 0.95; 0 for none
+objectness      probability that the object is a thing, and no piece of its support or of furniture; 1 for given masks
 
 All are float32 but id, status, label, seen, fused and reason, which are uint32.  Deviations are NaN where unknown.  The
 header copies stamp and frame of the depth image.  Readers find fields by name: a later version may append fields, and
@@ -79,7 +80,7 @@ FIELDS: tuple[tuple[str, int], ...] = tuple(
     )
 ) + tuple((name, UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
 FIELDS += tuple((f"sigma_{name}", FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
-FIELDS += (("kx", FLOAT32), ("ky", FLOAT32))
+FIELDS += (("kx", FLOAT32), ("ky", FLOAT32), ("objectness", FLOAT32))
 """Name and PointField datatype of every field, in the order of the message."""
 
 _NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index("label")])
@@ -106,6 +107,8 @@ class SuperquadricArray(Columns):
         NaN if not given.
     taper : (n, 2) float32
         0 if not given.
+    objectness : (n,) float32
+        NaN if not given.
 
     Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
     """
@@ -132,6 +135,7 @@ class SuperquadricArray(Columns):
         default=None,  # type: ignore[arg-type]
         metadata=column("kx", "ky", missing=0.0),
     )
+    objectness: np.ndarray | None = field(default=None, metadata=column("objectness"))
 
     @property
     def recovered(self) -> SuperquadricArray:

@@ -44,7 +44,7 @@ _SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11
 """Parts of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
 _OF_A_BODY = ("size", "shape", "translation", "rotation")
 """Columns of a message that are attributes of superquadrics of the same name."""
-_OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label")
+_OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label", "objectness")
 """Columns of a message that are attributes of a recovery of the same name."""
 
 Mesh = tuple[np.ndarray, np.ndarray]
@@ -259,6 +259,7 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
         **{name: getattr(bodies, name) for name in _OF_A_BODY},
         score=np.ones(count),
         residual=np.zeros(count),
+        objectness=np.ones(count),
         sigma_size=np.zeros((count, 3)),
         sigma_shape=np.zeros((count, 2)),
         sigma_centre=np.zeros((count, 3)),

@@ -67,6 +67,7 @@ def frame_entry(
                 "message": body.message,
                 "label": body.label if frame.labels is not None else None,
                 "pixels": body.pixels,
+                "objectness": body.objectness,
                 "track": None if track is None else _track_entry(track, frame.is_cube),
             }
         )
@@ -151,7 +152,7 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
         "taper": ["kx", "ky"],
         "seen": [f"seen_a{k}" for k in axes],
     }
-    single = ("score", "residual", "pixels", "label", "message")
+    single = ("score", "residual", "pixels", "objectness", "label", "message")
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = [name for group in columns.values() for name in group]

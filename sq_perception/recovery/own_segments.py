@@ -15,10 +15,11 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
               is more than ``_ONE``; the surest pairs first, until there is none
     strays    pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
               label image, as they are no background either, but no fit takes them for the object's surface
-    nothing   a is dropped if less than ``_OF_AN_OBJECT`` of its pixels are of an object: a bump of the table, a wall,
-              the room behind; not where there is no support plane, as all that is seen may be the object
+    nothing   a is dropped if it is no thing (:mod:`sq_perception.segmentation.objectness`), by the median logit of p_a
+              over it and by its rise: a bump of the table, a wall, the room behind; not where there is no support
+              plane, as all that is seen may be the object
     left      what is left by strays and by dropped segments, in pieces that are as large as an object, is asked about
-              once more: a piece is an object if it claims itself, and no other segment
+              once more: a piece is an object if it is a thing, and no other segment is of its object
 
 The network is asked once about a segment, and again about one that was parted or joined.
 """
@@ -33,11 +34,13 @@ import cv2
 import numpy as np
 
 from sq_perception.fitting.options import MIN_PIXELS
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import canonical_view, depth_steps, regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.segmentation import convex_parts, pieces, segments
+from sq_perception.segmentation import convex_parts, objectness, pieces, segments
+from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.segments import Segmentation
 
 _ONE = 0.45
@@ -58,19 +61,8 @@ _LEAST_TO_PART = 60
 """Cells of a segment that may be parted: 15 in a piece."""
 _LEAST_CELLS = 4
 """Cells that another segment has in a view at least, for a mean over them."""
-_OF_AN_OBJECT = 1 / 3
-"""Share of a segment's pixels that are of an object.  Of 599 segments of things, simulated and recorded, 593 have more,
-of 162 simulated ones of none 21."""
-_MOST_STRAYS = 0.5
-"""Share of a segment beyond which the network contradicts itself, as the object is what most of the segment shows: the
-segment keeps its pixels, if it is not dropped."""
 _ROUNDS = 3
 """Rounds of joining: eight pieces may become one."""
-_ITSELF_AFTER_ALL = 0.75
-"""A piece of what was left claims at least so much of itself, to be an object after all.  Of 2507 simulated things on
-tables, in rooms, furniture and crowds 226 are missed without a second look and 216 with it, and 204 and 209 segments
-are none of a thing.  53 pieces that it found to be things, in 2600 other scenes, all claim more than this, of 12 that
-were none 4 claim less."""
 _BRUSH = np.ones((7, 7), np.uint8)
 """Pixels; what is left along edges is thinner.  With 3 x 3 212 of them are missed, and on 14 recorded frames a second
 look adds 6 bodies of nothing to the 30 that there are without; with this 1."""
@@ -135,36 +127,45 @@ class SegmentNetwork:
             if not joined:
                 break
             seen |= self._seen(labels, joined)
-        shown = {label: _shown(labels, label, answer) for label, answer in seen.items()}
-        kept = [label for label, (_, share) in shown.items() if share >= _OF_AN_OBJECT or self.plane is None]
+        likely = self._things(labels, seen, found.heights)
         strays = np.zeros(labels.shape, bool)
-        for label in kept:
+        for label in likely:
             window = seen[label].window
-            strays[window] |= _strays(labels[window] == label, *shown[label])
-        left = self._left(labels, kept, strays)
-        if not parts and not left and len(kept) == len(found.ids):
-            return replace(found, strays=strays)
-        kept += left
-        counts = regions.extents(labels)[:, 0]
-        order = sorted(kept, key=lambda label: (-counts[label], label))
-        number = np.zeros(len(counts), np.int32)
-        number[order] = np.arange(len(order)) + 1
-        labels = regions.renumbered(labels, number)
-        return replace(found, labels=labels, ids=tuple(range(1, len(order) + 1)), strays=strays)
+            strays[window] |= _strays(labels[window] == label, _logits(seen[label]))
+        claims = _claimed(labels, {label: seen[label] for label in likely})
+        likely |= self._left(labels, list(likely), strays, found.heights)
+        found = replace(found, labels=labels, strays=strays, claims=claims)
+        return segments.kept(found, likely)
 
-    def _left(self, labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> list[int]:
-        """Label the objects among what no object claims; changes ``labels`` and ``strays``, returns the new labels."""
+    def _things(
+        self, labels: np.ndarray, seen: Mapping[int, _Seen], heights: HeightEvidence | None
+    ) -> dict[int, float]:
+        """The segments that are things, and with which probability; without a support all are."""
+        if heights is None:
+            return dict.fromkeys(seen, 1.0)
+        rise = heights.rise(labels, list(seen)).tolist()
+        likely = {}
+        for z, (label, answer) in zip(rise, seen.items(), strict=True):
+            median = quantile(_logits(answer)[labels[answer.window] == label], 0.5)
+            likely[label] = objectness.probability(objectness.logit(z, median))
+        return {label: each for label, each in likely.items() if each >= objectness.LEAST}
+
+    def _left(
+        self, labels: np.ndarray, kept: Sequence[int], strays: np.ndarray, heights: HeightEvidence | None
+    ) -> dict[int, float]:
+        """Label the things among what is of no object; changes ``labels`` and ``strays``, returns the new ones."""
         asked, names = _unclaimed(labels, kept, strays)
-        found = []
-        for label, answer in self._seen(asked, names).items() if names else ():
-            claims = _claims(asked, answer)
-            if claims[label] >= _ITSELF_AFTER_ALL and np.delete(claims, label).max() < _APART:
-                found.append(label)
+        seen = self._seen(asked, names) if names else {}
+        likely = {}
+        for label, each in self._things(asked, seen, heights).items():
+            answer = seen[label]
+            if np.delete(_claims(asked, answer), label).max() < _APART:
+                likely[label] = each
                 own = asked[answer.window] == label
                 labels[answer.window][own] = label
                 strays[answer.window] &= ~own
-                strays[answer.window] |= _strays(own, *_shown(asked, label, answer))
-        return found
+                strays[answer.window] |= _strays(own, _logits(answer))
+        return likely
 
     def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen], sigma: float) -> list[int]:
         """Part segments that are several objects, in ``labels``; returns the labels of all the parts.
@@ -306,6 +307,12 @@ def _claims(labels: np.ndarray, answer: _Seen) -> np.ndarray:
     return np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), 0)
 
 
+def _claimed(labels: np.ndarray, seen: Mapping[int, _Seen]) -> tuple[tuple[int, int], ...]:
+    """Pairs of labels a, b of which most of b is of the object that a shows."""
+    claims = {label: np.flatnonzero(_claims(labels, answer) > _ONE).tolist() for label, answer in seen.items()}
+    return tuple((one, other) for one, others in claims.items() for other in others if other != one)
+
+
 def _join(labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
     """Join pairs that are each other's object, each segment with one other; the labels that remain of them."""
     mutual, order = _mutual(labels, seen), list(seen)
@@ -352,14 +359,17 @@ def _unclaimed(labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> t
     return asked, names
 
 
-def _shown(labels: np.ndarray, label: int, answer: _Seen) -> tuple[np.ndarray, float]:
-    """The pixels of a segment, in its window, that show its object, and their share."""
-    inside = labels[answer.window] == label
-    pixels = inside & (answer.view.at_pixels(answer.logits, answer.window) >= 0)
-    return pixels, np.count_nonzero(pixels) / np.count_nonzero(inside)
+def _logits(answer: _Seen) -> np.ndarray:
+    """The logits of p at the pixels of a segment's window."""
+    return answer.view.at_pixels(answer.logits, answer.window)
 
 
-def _strays(inside: np.ndarray, own: np.ndarray, share: float) -> np.ndarray:
-    """The pixels of a segment that are not its object's own; none of one that has next to no other pixels."""
-    contradicts = share < 1 - _MOST_STRAYS or np.count_nonzero(own) < MIN_PIXELS
+def _strays(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
+    """The pixels of a segment that are not its object's own.
+
+    None where they are most of it, as the object is what most of the segment shows, or nearly all.
+    """
+    own = inside & (logits >= 0)
+    count = np.count_nonzero(own)
+    contradicts = 2 * count < np.count_nonzero(inside) or count < MIN_PIXELS
     return np.zeros_like(inside) if contradicts else inside & ~own

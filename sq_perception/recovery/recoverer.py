@@ -62,8 +62,6 @@ __all__ = [
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
-_SEGMENTS = 2
-"""For each object that is asked for: a network joins some, and drops what shows none, which may be the largest."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,8 +272,10 @@ class Recoverer:
             fitted = time.perf_counter()
 
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
+        segmentation = found.segmentation
+        likely = dict(zip(segmentation.ids, segmentation.objectness, strict=False))
         recovered = {
-            obj.label: Recovery(fit, score, obj.label, obj.pixels)
+            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0))
             for obj, fit, score in zip(fresh, fits, scores, strict=True)
         }
         bodies = tuple(known[obj.label] if obj.label in known else recovered[obj.label] for obj in found.objects)
@@ -287,10 +287,13 @@ class Recoverer:
             "score": 1e3 * (scored - fitted),
             "total": 1e3 * (scored - readings.began),
         }
-        segmentation = found.segmentation
-        message = _left_out(segmentation, options) if bodies else _why_empty(depth, segmentation, readings.labels)
         doubt = _doubt(readings.depth, camera)
-        message = "; ".join(filter(None, (message, doubt)))
+        said = (
+            _without_support(segmentation, readings) if bodies else _why_empty(depth, segmentation, readings.labels),
+            _left_out(segmentation, options),
+            doubt,
+        )
+        message = "; ".join(filter(None, said))
         return FrameRecovery(bodies, milliseconds, segmentation.labels, segmentation.plane, message, doubt)
 
     @contextmanager
@@ -307,14 +310,11 @@ class Recoverer:
         depth, camera, options = readings.depth, readings.camera, readings.options
         if readings.labels is not None:
             return segments.from_labels(readings.labels, depth, camera, options)
-        if not (options.repair and isinstance(self._network_for(readings), inference.ThingPredictor)):
-            return segments.segment(depth, camera, options)
-        found = segments.segment(depth, camera, replace(options, max_objects=_SEGMENTS * options.max_objects))
-        found = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
-        if len(found.ids) <= options.max_objects:
-            return found
-        most = found.ids[: options.max_objects]
-        return replace(found, labels=np.where(np.isin(found.labels, most), found.labels, 0), ids=most, is_cut=True)
+        proposed = segments.proposed(depth, camera, options.depth_range)
+        if options.repair and isinstance(self._network_for(readings), inference.ThingPredictor):
+            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared)
+            return segments.limited(network.improved(proposed), depth, camera, options)
+        return segments.limited(segments.judged(proposed), depth, camera, options)
 
     def _network_for(self, readings: Readings) -> Network | None:
         if readings.options.method not in NEEDS_NETWORK:
@@ -417,9 +417,16 @@ def _doubt(depth: np.ndarray, camera: Camera) -> str:
 
 
 def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
-    if not found.is_cut:
-        return ""
-    return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
+    """What was seen and is not among the objects, in words."""
+    said = []
+    if found.larger:
+        objects = "1 object is" if found.larger == 1 else f"{found.larger} objects are"
+        said.append(f"{objects} larger than max_size = {options.max_size:g} m and left out")
+    if found.outside:
+        said.append(f"{found.outside} outside of the workspace left out")
+    if found.is_cut:
+        said.append(f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out")
+    return "; ".join(said)
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarray | None) -> str:
@@ -427,6 +434,13 @@ def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarr
         return "the image holds no depth"
     if labels is not None and labels.max() <= 0:
         return "the masks hold no object"
+    if found.larger or found.outside:
+        return "no object of the wanted size and place"
     if found.plane is not None:
         return "nothing stands on the plane"
-    return "no object of the wanted size and distance"
+    return "no support plane and no object found"
+
+
+def _without_support(found: segments.Segmentation, readings: Readings) -> str:
+    is_own = readings.labels is None and readings.camera.is_pinhole
+    return "no support plane found" if is_own and found.plane is None else ""

@@ -32,6 +32,8 @@ class Recovery:
         The object's value in the label image.
     pixels : int
         Measured pixels of the object.
+    objectness : float
+        Probability that it is a thing (:mod:`sq_perception.segmentation.objectness`); 1 for masks from outside.
     repeats : int
         Frames before this one whose readings the body was recovered from, as these are the same but for noise
         (:mod:`sq_perception.recovery.still_scene`): an answer given before, with the same error.  0: from this frame.
@@ -41,6 +43,7 @@ class Recovery:
     score: float
     label: int
     pixels: int
+    objectness: float = 1.0
     repeats: int = 0
 
     @property

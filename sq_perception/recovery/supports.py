@@ -25,6 +25,7 @@ from sq_perception.imaging import lens
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
 from sq_perception.segmentation import segments, support_plane
+from sq_perception.segmentation.extent import across
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.support_plane import TOLERANCE
 
@@ -118,7 +119,7 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
     if not near:
         return None
     reach = _reach(obj)
-    axes, best = support_plane.across(plane[:3]), 0.0
+    axes, best = across(plane[:3]), 0.0
     points = obj.points
     feet = _seen_from_above(points[points @ plane[:3] + plane[3] < low + _FEET], axes)
     for other in near:

@@ -6,9 +6,6 @@ joined; and each body continued down to its foot.  Metres and pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-
 import cv2
 import numpy as np
 
@@ -16,7 +13,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_parts, standing, support_surface
+from sq_perception.segmentation import convex_parts, support_surface
 from sq_perception.segmentation.support_surface import SupportSurface
 
 LEAST_SIGMA = 5e-4
@@ -37,20 +34,20 @@ _JAGGED = 0.3
 beyond which it is noise: of independent noise most do, of a side seen at a grazing angle hardly any."""
 
 
-def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support: SupportSurface) -> np.ndarray:
+def above(
+    known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
+) -> np.ndarray:
     """Bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
 
-    ``relative`` are heights (height, width) above the support, metres at one metre of depth, 0 where there is no depth;
-    ``valid`` is where bodies are looked for.
+    ``known`` and ``relative`` (height, width) are depth, and height above the support as at one metre of depth, both 0
+    where nothing is looked for; ``valid`` is where something is.
     """
-    known, camera = seen.known, seen.camera
     labels = np.zeros(known.shape, np.int32)
     clear = cv2.blur(relative, (3, 3)) > support.clear_height
     # The mean beside a tall body is that of its height: the pixel itself decides there.
     raised = relative > 0.5 * support.clear_height
     raised &= ~support_surface.risen(relative, known, valid, camera)
     clear &= raised
-    clear &= ~standing.furniture(seen, clear)
     left, top, width, height = regions.box(clear)
     if width == 0:
         return labels
@@ -60,23 +57,16 @@ def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support:
     # Contiguous, as kernels are compiled for arrays of a kind.
     known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
     camera = camera.cropped(left, top, known.shape[1], known.shape[0])
-    holds = partial(seen.options.is_small, up=support.plane.equation[:3])
-    inside = taken_apart(known, clear, camera, support.sigma, holds)
+    inside = taken_apart(known, clear, camera, support.sigma)
     foot = raised[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
 
 
-def taken_apart(
-    depth: np.ndarray,
-    wanted: np.ndarray,
-    camera: Camera,
-    sigma: float,
-    holds: Callable[[np.ndarray], bool],
-) -> np.ndarray:
+def taken_apart(depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
     """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and by lines of sight."""
     labels = _components(depth, wanted, camera)
-    return convex_parts.corrected(labels, depth, camera, max(sigma, LEAST_SIGMA), holds)
+    return convex_parts.corrected(labels, depth, camera, max(sigma, LEAST_SIGMA))
 
 
 def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.ndarray:

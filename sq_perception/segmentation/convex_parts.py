@@ -29,7 +29,7 @@ Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -68,7 +68,6 @@ def corrected(
     depth: np.ndarray,
     camera: Camera,
     sigma: float,
-    holds: Callable[[np.ndarray], bool] | None = None,
 ) -> np.ndarray:
     """Segments taken apart where they are several convex bodies, and joined where they are one.
 
@@ -82,8 +81,6 @@ def corrected(
         A pinhole camera.
     sigma
         Noise of the depth at one metre, metres; it grows with the square of the depth.
-    holds
-        Whether points (n, 3) may be one thing; segments whose points together may not stay apart.
 
     Returns
     -------
@@ -98,7 +95,7 @@ def corrected(
     number_of = np.arange(len(origin), dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
-        crossed = _crossed_between(image, parts, np.array(origin), insides, holds)
+        crossed = _crossed_between(image, parts, np.array(origin), insides)
         group = convex_pieces.linked(crossed, np.array([len(part.z) for part in parts], float), AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
@@ -191,12 +188,11 @@ def _crossed_between(
     parts: list[Samples],
     origin: np.ndarray,
     insides: list[tuple[int, int]],
-    holds: Callable[[np.ndarray], bool] | None,
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between each two segments.
 
     0 where two go on behind something nearer or are of one vessel; inf where they are neither these nor near each
-    other, or where their points together are no thing.
+    other.
     """
     names = np.array([part.label for part in parts])
     together = pixels, points, ends = _together(parts)
@@ -213,9 +209,6 @@ def _crossed_between(
         before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
         vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
         crossed[np.ix_(vessel, vessel)] = 0.0
-    for a, b in np.argwhere(np.tril(crossed < AS_ONE)):
-        if holds is not None and not holds(np.concatenate([parts[a].points, parts[b].points])):
-            crossed[a, b] = crossed[b, a] = np.inf
     # The bottom of a vessel is seen over its wall alone: no line tells it from the bottom of the next one.
     is_enclosed = regions.enclosed(borders[0])[names]
     crossed[(is_enclosed[:, None] | is_enclosed) & (met == 0)] = np.inf

@@ -23,7 +23,7 @@ from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
-from sq_perception.segmentation.options import TURNS
+from sq_perception.segmentation.extent import TURNS, across
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
@@ -43,7 +43,7 @@ class LevelFace:
 
     def under(self, labels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
         """Pixels, bool (height, width), of the segment itself and of all segments whose middle is right above it."""
-        axes = TURNS @ support_plane.across(self.surface.plane.equation[:3]).T
+        axes = TURNS @ across(self.surface.plane.equation[:3]).T
         reach = axes @ self.points.T
         low, high = reach.min(axis=1), reach.max(axis=1)
         is_over = np.zeros(int(labels.max(initial=0)) + 1, bool)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.geometry import rotation
-from sq_perception.segmentation import support_plane
+from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 
 Box = tuple[float, float, float, float, float, float]
 Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
@@ -18,12 +18,6 @@ Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
 
 EVERYTHING = (0.0, np.inf)
 """Range of all depths, metres."""
-_SAMPLES = 400
-"""Pixels of a segment, evenly taken: the 1 % that may stick out are a few still."""
-_OUTLIERS = 0.01
-"""Share of the points at either end that do not count for the extent: sensors smear edges."""
-TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)
-"""Directions (18, 2) in which edges are measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +41,7 @@ class SegmentationOptions:
 
     depth_range: tuple[float, float] = EVERYTHING
     max_objects: int = 20
-    max_size: float = 0.6
+    max_size: float = LARGEST_THING
     workspace: Box | None = None
     workspace_pose: Pose | None = None
 
@@ -72,10 +66,6 @@ class SegmentationOptions:
         if not self.max_size > 0:
             raise ValueError(f"max_size: expected a positive number, got {self.max_size}")
 
-    def hold(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
-        """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
-        return self.is_within(points) and self.is_small(points, up)
-
     def is_small(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
         """Whether points (n, 3) are no larger than a thing."""
         return largest_edge(points, up) <= self.max_size
@@ -89,25 +79,3 @@ class SegmentationOptions:
             points = points @ rotation.to_matrix(np.array(turn)).T + np.array(place)
         middle = np.median(points, axis=0)
         return bool((middle >= self.workspace[:3]).all() and (middle <= self.workspace[3:]).all())
-
-
-def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
-    """Largest edge of the box around points (n, 3) whose largest edge is least, metres: upright, or of principal axes.
-
-    A hundredth of the points at either end may stick out.
-    """
-    points = points[:: 1 + len(points) // _SAMPLES]
-    if up is None:
-        axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
-        return float(_extents(axes.T @ points.T).max())
-    edges = _extents(np.concatenate([TURNS @ support_plane.across(up).T, up[None]]) @ points.T)
-    # A quarter turn apart, the two edges of one rectangle.
-    half = len(TURNS) // 2
-    return float(max(np.maximum(edges[:half], edges[half:-1]).min(), edges[-1]))
-
-
-def _extents(values: np.ndarray) -> np.ndarray:
-    """The extent of the values of each row, without what sticks out."""
-    ordered = np.sort(values, axis=1)
-    out = int(_OUTLIERS * values.shape[1])
-    return np.asarray(ordered[:, -1 - out] - ordered[:, out])

@@ -1,29 +1,29 @@
-"""Objects on a table: the support plane away, what stands on it taken apart.
+"""Objects of a depth image: the support plane away, what stands on it taken apart, and what is no thing left out.
 
 Steps
 -----
-1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it; walls and other
-   planes larger than a thing go first.
-2. Components of it that no depth step cuts (steps 2 to 4: :mod:`sq_perception.segmentation.bodies`).
-3. A component within which lines of sight cross empty space is several bodies.  Two components are one body if no line
-   between them does, or if they go on behind something nearer (:mod:`sq_perception.segmentation.convex_parts`).
-4. Each body is continued down to the edge of the noise on the table.
-5. What stands on the level top of a segment is looked for again, with that top as its support: where it rises by little
-   more than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
-6. Walls of a bin around things go (:mod:`sq_perception.segmentation.enclosures`).
-7. What remains is an object if it stands on the support and is no larger than a thing
-   (:mod:`sq_perception.segmentation.standing`).
+1. The support plane (:mod:`sq_perception.segmentation.support_plane`), bent as the sensor bends it
+   (:mod:`sq_perception.segmentation.support_surface`), and what is clearly above it.
+2. Components of it that no depth step cuts, taken apart where lines of sight within them cross empty space, and joined
+   where none between them does (:mod:`sq_perception.segmentation.bodies`).
+3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
+   than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
+4. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
+   its surroundings sharpens (:mod:`sq_perception.recovery.own_segments`).
+5. Limits of size and place, and of number, are asked of what then remains.
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
-Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'
-world: there is no plane, and every connected set of pixels in the workspace is an object, of any size.
+Things on a higher table are found as well, those on a lower one are not.  Where no support is seen all readings are
+taken apart; where they are a silhouette no larger than a thing, as of a masked image, they are that thing.  An
+orthographic camera sees the thesis' world: there is no plane, and every connected set of pixels in the workspace is an
+object, of any size.
 
 Metres and pixels.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import cv2
@@ -34,13 +34,14 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     bodies,
     convex_parts,
-    enclosures,
     level_faces,
+    objectness,
     pieces,
-    standing,
     support_plane,
     support_surface,
 )
+from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
+from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
@@ -49,6 +50,12 @@ of noise."""
 _UNKNOWN_SIGMA = 1.5e-3
 """Noise of the depth at one metre where no support shows it, metres: that of structured light (Khoshelham and Oude
 Elberink, Sensors 2012)."""
+_MOST = 128
+"""Segments that are looked at, the largest ones: bounds the time of frames that are noise alone."""
+_SIDE_MEASURED = 0.6
+"""Share of a side of the readings' box from which on they go on beyond it: a silhouette touches it here and there."""
+_POINTS = 400
+"""Points of a segment for its size and its middle."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +76,14 @@ class Segmentation:
         Whether there were more objects than ``max_objects``.
     strays : bool (height, width) or None
         Pixels of objects that did not measure them; None: not a single one that is known.
+    objectness : tuple of float
+        The probability, by ``ids``, that each is a thing; 1 for labels given from outside.
+    larger, outside
+        How many objects were left out as they are larger than ``max_size``, or outside of the workspace.
+    claims : tuple of pairs
+        Labels a, b: a network says that most of b is of the object that a shows.
+    heights : HeightEvidence or None
+        What the segments are judged by, until they are.
     """
 
     labels: np.ndarray
@@ -77,6 +92,11 @@ class Segmentation:
     sigma: float = _UNKNOWN_SIGMA
     is_cut: bool = False
     strays: np.ndarray | None = None
+    objectness: tuple[float, ...] = ()
+    larger: int = 0
+    outside: int = 0
+    claims: tuple[tuple[int, int], ...] = ()
+    heights: HeightEvidence | None = None
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
@@ -99,21 +119,83 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         If the image does not fit the camera.
     """
     options = options or SegmentationOptions()
-    depth, valid = _checked(depth, camera, options.depth_range)
+    return limited(judged(proposed(depth, camera, options.depth_range)), depth, camera, options)
+
+
+def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> Segmentation:
+    """Segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
+    depth, valid = _checked(depth, camera, depth_range)
+    least = least_pixels(depth.size)
     if not camera.is_pinhole:
-        return _in_cube(depth, valid, camera, options)
-    if np.count_nonzero(valid) < least_pixels(depth.size):
+        return _ordered(Segmentation(depth_steps.components(valid), None, ()), least)
+    if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
-    planes = support_plane.planes(depth, valid, camera)
-    plane = support_plane.support(planes, depth, valid, camera, options.is_small)
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
-    everything = known
-    if options.depth_range != EVERYTHING:
-        # What is out of range holds things up and hides them all the same.
-        everything, measured = _checked(depth, camera, EVERYTHING)
-        everything = cv2.copyTo(everything, measured.view(np.uint8))
-    seen = standing.Seen(everything, known, camera, [other for other in planes if other is not plane], options)
-    return _without_support(seen, valid) if plane is None else _on_support(seen, valid, plane)
+    is_silhouette = _is_silhouette(valid)
+    if is_silhouette and largest_edge(_some_points(valid, known, camera)) <= LARGEST_THING:
+        return _ordered(Segmentation(depth_steps.components(valid), None, ()), least)
+    planes = support_plane.planes(depth, valid, camera)
+    plane = support_plane.support(planes, depth, valid, camera)
+    if plane is None:
+        return _without_support(known, valid, camera)
+    support = support_surface.measured(plane, known, valid, camera)
+    relative = support.image_relative(known, camera)
+    labels = bodies.above(known, camera, relative, valid, support)
+    sigma = max(support.sigma, bodies.LEAST_SIGMA)
+    tops = level_faces.samples(labels, known, camera, least)
+    for face in level_faces.found(tops, labels, known, camera, support, least):
+        labels = _unloaded(labels, face, known, camera, least)
+    found = _ordered(Segmentation(labels, plane.equation, (), sigma), least)
+    if is_silhouette and not found.ids:
+        return _without_support(known, valid, camera)
+    return replace(found, heights=HeightEvidence(relative, found.labels, support.sigma))
+
+
+def judged(found: Segmentation) -> Segmentation:
+    """Segments that are things by their heights alone: for use without a network."""
+    if found.heights is None:
+        return found
+    rise = found.heights.rise(found.labels, found.ids).tolist()
+    likely = {k: objectness.probability(objectness.logit(z)) for k, z in zip(found.ids, rise, strict=True)}
+    return kept(found, {label: each for label, each in likely.items() if each >= objectness.LEAST})
+
+
+def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
+    """The segments of some labels, with the probability that each is a thing; renumbered from 1, the largest first."""
+    counts = np.bincount(found.labels.ravel(), minlength=max(likely, default=0) + 1)
+    order = sorted(likely, key=lambda label: (-counts[label], label))
+    number = np.zeros(len(counts), np.int32)
+    number[order] = np.arange(len(order)) + 1
+    return replace(
+        found,
+        labels=regions.renumbered(found.labels, number),
+        ids=tuple(range(1, len(order) + 1)),
+        objectness=tuple(likely[label] for label in order),
+        claims=tuple((int(number[a]), int(number[b])) for a, b in found.claims if number[a] and number[b]),
+    )
+
+
+def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> Segmentation:
+    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``.
+
+    What claims to be a piece of one that is too large is left out as well.
+    """
+    depth, valid = _checked(depth, camera, options.depth_range)
+    up = None if found.plane is None else found.plane[:3]
+    larger, outside = set(), set()
+    for label in found.ids:
+        points = _some_points((found.labels == label) & valid, depth, camera)
+        if camera.is_pinhole and not options.is_small(points, up):
+            larger.add(label)
+        elif not options.is_within(points):
+            outside.add(label)
+    of_larger = {one for one, other in found.claims if other in larger}
+    left = [label for label in found.ids if label not in larger | outside | of_larger]
+    ids = left[: options.max_objects]
+    likely = dict(zip(found.ids, found.objectness or (1.0,) * len(found.ids), strict=True))
+    is_cut = found.is_cut or len(left) > len(ids)
+    found = replace(found, is_cut=is_cut, larger=len(larger), outside=len(outside), heights=None)
+    return kept(found, {label: likely[label] for label in ids})
 
 
 def from_labels(
@@ -163,7 +245,7 @@ def from_labels(
     plane = None
     if ids and camera.is_pinhole:
         plane = support_plane.around(labels, ids, depth, valid, camera)
-    return Segmentation(labels, plane, ids, is_cut=is_cut)
+    return Segmentation(labels, plane, ids, is_cut=is_cut, objectness=(1.0,) * len(ids))
 
 
 def least_pixels(size: int) -> int:
@@ -208,72 +290,42 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
-def _in_cube(depth: np.ndarray, valid: np.ndarray, camera: Camera, options: SegmentationOptions) -> Segmentation:
-    """The objects of an orthographic image."""
-
-    def is_within(rows: np.ndarray, columns: np.ndarray) -> bool:
-        return options.is_within(camera.unproject(columns, rows, depth[rows, columns]))
-
-    accept = None if options.workspace is None else is_within
-    labels, ids, is_cut = _ordered(depth_steps.components(valid), least_pixels(depth.size), options.max_objects, accept)
-    return Segmentation(labels, None, ids, is_cut=is_cut)
+def _some_points(wanted: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    return regions.some_points(*np.nonzero(wanted), depth, camera, _POINTS)
 
 
-def _without_support(seen: standing.Seen, valid: np.ndarray) -> Segmentation:
-    """The objects of an image that shows no support plane."""
-    free = valid & ~standing.furniture(seen, valid)
-    labels = bodies.taken_apart(seen.known, free, seen.camera, _UNKNOWN_SIGMA, seen.options.is_small)
-    least = least_pixels(valid.size)
-    labels, ids, is_cut = _ordered(labels, least, seen.options.max_objects, standing.alone(seen))
-    return Segmentation(labels, None, ids, is_cut=is_cut)
+def _is_silhouette(valid: np.ndarray) -> bool:
+    """Whether the readings (height, width) end within their box, and not at its sides, as a view's do."""
+    left, top, width, height = regions.box(valid)
+    inside = valid[top : top + height, left : left + width]
+    sides = [side.mean() for side in (inside[0], inside[-1], inside[:, 0], inside[:, -1])]
+    return bool(sorted(sides)[-2] < _SIDE_MEASURED)
 
 
-def _on_support(seen: standing.Seen, valid: np.ndarray, plane: support_plane.Plane) -> Segmentation:
-    """The objects that stand on a plane of the image."""
-    known, camera, least = seen.known, seen.camera, least_pixels(valid.size)
-    support = support_surface.measured(plane, known, valid, camera)
-    relative = support.image_relative(seen.depth, camera)
-    labels = bodies.above(seen, relative * valid, valid, support)
-    samples = level_faces.samples(labels, known, camera, least)
-    for face in level_faces.found(samples, labels, known, camera, support, least):
-        labels = _unloaded(labels, face, seen, least)
-    around = enclosures.walls(samples, plane.equation)
-    if around:
-        labels = np.where(np.isin(labels, list(around)), 0, labels)
-    test = standing.standing(seen, relative, labels, support)
-    labels, ids, is_cut = _ordered(labels, least, seen.options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA), is_cut)
+def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera) -> Segmentation:
+    """The segments of an image that shows no support plane, but those that fill it, as a wall does."""
+    labels = bodies.taken_apart(known, valid, camera, _UNKNOWN_SIGMA)
+    found = _ordered(Segmentation(labels, None, ()), least_pixels(valid.size))
+    extents = regions.extents(found.labels)[:, [3, 1, 4, 2]]
+    boxes = {k: (extents[k, 0], extents[k, 1], *(extents[k, 2:] - extents[k, :2])) for k in found.ids}
+    return kept(found, {k: 1.0 for k, box in boxes.items() if _is_silhouette(valid) or not regions.fills(box, valid)})
 
 
-def _unloaded(labels: np.ndarray, face: level_faces.LevelFace, seen: standing.Seen, least: int) -> np.ndarray:
+def _unloaded(
+    labels: np.ndarray, face: level_faces.LevelFace, known: np.ndarray, camera: Camera, least: int
+) -> np.ndarray:
     """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
-    relative = face.surface.image_relative(seen.depth, seen.camera)
-    valid = face.under(labels, seen.known, seen.camera) & (relative > -support_plane.TOLERANCE)
-    parts = bodies.above(seen, relative * valid, valid, face.surface)
-    test = standing.standing(seen, relative, parts, face.surface)
-    parts, _, _ = _ordered(parts, least, parts.max(initial=0), test)
-    return np.where(parts > 0, parts + labels.max(), labels)
+    relative = face.surface.image_relative(known, camera)
+    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
+    parts = _ordered(Segmentation(bodies.above(known, camera, relative * valid, valid, face.surface), None, ()), least)
+    heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.surface.sigma)
+    parts = judged(replace(parts, heights=heights))
+    return np.where(parts.labels > 0, parts.labels + labels.max(), labels)
 
 
-def _ordered(
-    labels: np.ndarray, least: int, most: int, accept: standing.ObjectTest | None = None
-) -> tuple[np.ndarray, tuple[int, ...], bool]:
-    """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them, and
-    whether there are more.
-
-    Those that are not accepted are asked about once more: the test knows the things beside them then.
-    """
-    extents = regions.extents(labels)
-    order = np.argsort(-extents[:, 0], kind="stable")
-    order = order[extents[order, 0] >= least]
-    kept: set[int] = set()
-    is_cut = False
-    for label in np.tile(order, 1 if accept is None else 2).tolist():
-        if label not in kept and (accept is None or accept(*regions.pixels(labels, label, extents[label]))):
-            is_cut = len(kept) == most
-            if is_cut:
-                break
-            kept.add(label)
-    number = np.zeros(len(extents), np.int32)
-    number[[label for label in order.tolist() if label in kept]] = np.arange(len(kept)) + 1
-    return regions.renumbered(labels, number), tuple(range(1, len(kept) + 1)), is_cut
+def _ordered(found: Segmentation, least: int) -> Segmentation:
+    """The largest segments of at least so many pixels."""
+    counts = np.bincount(found.labels.ravel())
+    order = np.argsort(-counts[1:], kind="stable") + 1
+    order = order[counts[order] >= least]
+    return kept(replace(found, is_cut=len(order) > _MOST), dict.fromkeys(order[:_MOST].tolist(), 1.0))

@@ -19,7 +19,6 @@ Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Conse
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -30,6 +29,7 @@ from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import coarse_grid
+from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 
 TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
@@ -145,7 +145,6 @@ def support(
     depth: np.ndarray,
     valid: np.ndarray,
     camera: Camera,
-    is_small: Callable[[np.ndarray, np.ndarray], bool],
 ) -> Plane | None:
     """The plane that things stand on, of some planes of an image; None if none of them is one.
 
@@ -168,8 +167,6 @@ def support(
         As by :func:`planes`.
     depth, valid : (height, width)
         Metres, and where they are a measurement.
-    is_small
-        Whether points (n, 3), on a plane with this normal (3,), are no larger than a thing.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
@@ -188,7 +185,7 @@ def support(
         return None
 
     def is_thing(plane: Plane) -> bool:
-        return is_small(_largest_part(plane, depth, valid, camera), plane.equation[:3])
+        return largest_edge(_largest_part(plane, depth, valid, camera), plane.equation[:3]) <= LARGEST_THING
 
     tables = [
         plane
@@ -330,14 +327,6 @@ def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
         if inside > on:
             on, alone = inside, is_island
     return alone
-
-
-def across(normal: np.ndarray) -> np.ndarray:
-    """Two axes (3, 2) at right angles to a normal."""
-    x, y, z = normal.tolist()
-    a, b, c = (z, 0.0, -x) if abs(z) > 0.5 else (-y, x, 0.0)
-    axes = np.array([[a, y * c - z * b], [b, z * a - x * c], [c, x * b - y * a]])
-    return axes / math.sqrt(a * a + b * b + c * c)
 
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:

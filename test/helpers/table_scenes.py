@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.learning import inference
+from sq_perception.recovery.own_segments import SegmentNetwork
+from sq_perception.segmentation import segments
+from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.simulation.scenes import plane_depth
 
 VGA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -55,3 +61,13 @@ def best_iou(mask, labels):
 def ious(truth, labels):
     """Of each body, likewise."""
     return [best_iou(truth == k, labels) for k in range(1, truth.max() + 1)]
+
+
+masks = cache(inference.load_masks)
+
+
+def judged_by_network(depth, camera, **options):
+    """The segments of an image as a recoverer has them: with the shipped network of masks."""
+    found = segments.proposed(depth, camera)
+    network = SegmentNetwork(masks(), depth, camera, found.plane, lambda function, labels: function(labels))
+    return segments.limited(network.improved(found), depth, camera, SegmentationOptions(**options))

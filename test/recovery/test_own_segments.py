@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -16,6 +17,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.learning import inference
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.rendering import render_things
@@ -36,7 +38,8 @@ def seen(bodies: list[Superquadric]) -> tuple[np.ndarray, np.ndarray]:
 def segmentation(labels: np.ndarray) -> Segmentation:
     counts = np.bincount(labels.ravel())
     ids = sorted(np.flatnonzero(counts)[1:].tolist(), key=lambda label: -counts[label])
-    return Segmentation(labels, PLANE, tuple(ids))
+    heights = np.where(labels > 0, 0.05, 1e-4).astype(np.float32)
+    return Segmentation(labels, PLANE, tuple(ids), heights=HeightEvidence(heights, labels, 1e-3))
 
 
 class GivenLogits:
@@ -153,7 +156,7 @@ def test_the_ends_of_a_box_behind_a_post_stay_one_whatever_the_network_says(befo
     def doubts_the_box(views: np.ndarray) -> np.ndarray:
         if network.asked > 2:  # pieces of the box
             return claims_of_halves(views)
-        return np.where(views[..., segment_view.SEGMENT] > 0, np.array([0.4, 3.0])[:, None, None], -3.0)
+        return np.where(views[..., segment_view.SEGMENT] > 0, np.array([1.2, 3.0])[:, None, None], -3.0)
 
     network = GivenLogits(doubts_the_box)
     found = of(network, depth).improved(segmentation(labels))
@@ -169,7 +172,7 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
 
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(right_alone)
-    found = of(network, depth).improved(segmentation(truth))
+    found = of(network, depth).improved(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
     assert network.asked > 1
 
@@ -221,7 +224,7 @@ def stray_in_rows(share: float) -> Any:
 
 def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(stray_in_rows(0.55), depth).improved(segmentation(truth))
+    found = of(stray_in_rows(0.55), depth).improved(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
     assert not found.strays.any()
 
@@ -238,7 +241,7 @@ def test_without_a_support_nothing_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
     network = SegmentNetwork(stray_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
-    assert network.improved(segmentation(truth)).ids == (1,)
+    assert network.improved(replace(segmentation(truth), plane=None, heights=None)).ids == (1,)
 
 
 def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:

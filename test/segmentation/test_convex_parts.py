@@ -103,19 +103,6 @@ def test_a_cup_between_two_balls_is_parted_from_them_and_keeps_its_inside():
     assert min(ious(truth, found)) > 0.7
 
 
-def test_what_is_no_thing_together_stays_apart():
-    """A strip that goes far back beside a box may be its side, as far as lines of sight tell."""
-    depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
-    depth[80:160, 100:200] = 1.0
-    depth[80:160, 200:240] = 1 / np.linspace(1.0, 1 / 1.3, 40)
-    labels = np.zeros(depth.shape, np.int32)
-    labels[80:160, 100:200], labels[80:160, 200:240] = 1, 2
-    together = convex_parts.corrected(labels, depth, CAMERA, NOISE)
-    assert len(names(together)) == 1
-    apart = convex_parts.corrected(labels, depth, CAMERA, NOISE, lambda points: np.ptp(points[:, 2]) < 0.1)
-    assert len(names(apart)) == 2
-
-
 def test_other_names_give_the_same_segments():
     depth, truth = seen([body(-0.1), body(0.0), body(0.1)])
     one = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
