@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from sq_perception.fitting.cost import Terms
-from sq_perception.fitting.covariance import Alternative, covariance_at
+from sq_perception.fitting.covariance import UNTAPERED, Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import ON_SUPPORT, Observation
@@ -83,7 +83,7 @@ class Problem:
     terms
         Constants of the residuals and priors.
     limits
-        Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3.
+        Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y.
     deadline
         ``time.perf_counter`` after which nothing new is tried.
     independent
@@ -135,6 +135,12 @@ class Problem:
     def with_terms(self, **changed: float) -> Problem:
         """The problem with some terms changed."""
         return replace(self, terms=Terms(**{**self.terms._asdict(), **changed}))
+
+    def within(self, taper: float) -> Problem:
+        """The problem with tapers up to a limit."""
+        lower, upper = (limit.copy() for limit in self.limits)
+        lower[8:], upper[8:] = -taper, taper
+        return replace(self, limits=(lower, upper))
 
     def without_hull(self) -> Problem:
         """The problem as if no hull had been predicted."""
@@ -245,6 +251,16 @@ class Solution:
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (11, 11) from the valley of the cost around the body and its distance to a predicted hull."""
+        return np.ascontiguousarray(self._with_taper[:UNTAPERED, :UNTAPERED])
+
+    @property
+    def taper_covariance(self) -> np.ndarray:
+        """Covariance (2, 2) of the tapers; 0 where the body may not taper."""
+        found = self._with_taper[UNTAPERED:, UNTAPERED:]
+        return np.ascontiguousarray(found) if len(found) else np.zeros((2, 2))
+
+    @cached_property
+    def _with_taper(self) -> np.ndarray:
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
         return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
 

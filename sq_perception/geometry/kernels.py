@@ -290,7 +290,7 @@ def support_at(
     k1: float,
     k2: float,
 ) -> Support:
-    """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; any sine will do without a taper."""
+    """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; without a taper any will do."""
     u, v = a1 * abs(nx), a2 * abs(ny)
     is_tapered = k1 != 0.0 or k2 != 0.0
     t = 0.0
