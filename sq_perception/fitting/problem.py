@@ -70,6 +70,10 @@ VOLUME_PRICE = 0.5
 """Price of log(a1 a2 a3) in the cost: what the image does not determine is not to grow.  Chosen on scanned objects."""
 
 
+class PlaneError(ValueError):
+    """A support plane that most of the object lies behind."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """One object to fit.
@@ -110,14 +114,14 @@ class Problem:
 
         Raises
         ------
-        ValueError
+        PlaneError
             If most of the object lies behind its support, as where the normal of that has the wrong sign.
         """
         if options.plane is not None:
             height = quantile(observation.points @ options.plane[:3] + options.plane[3], 0.5)
             if height < -ON_SUPPORT:
                 turned = "is it what this object stands on, and does its normal n point away from that?"
-                raise ValueError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
+                raise PlaneError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
         terms, bounds = terms_of(observation, options), limits(observation.points)
         return cls(observation, options, terms, bounds, began + options.time_budget)
 

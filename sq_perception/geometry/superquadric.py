@@ -240,7 +240,8 @@ class Superquadric:
         xp = array_namespace(points)
         high = (points[..., 2] / self.size[..., None, 2])[..., None]
         taper = self.taper[..., None, :]
-        return xp.maximum(1 + taper * high, 1 - xp.abs(taper))
+        scale, narrow = 1 + taper * high, 1 - xp.abs(taper)
+        return xp.where(scale >= narrow, scale, narrow)  # no maximum: its gradient is half where both are 1
 
     def inside_outside(self, points: Array) -> Array:
         """F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow to inf far from sharp bodies."""

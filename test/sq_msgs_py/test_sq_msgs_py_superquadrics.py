@@ -24,8 +24,8 @@ HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
 BEFORE = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
 COUNTS = ("label", "seen", "fused", "reason")
 DEVIATIONS = ("sigma_shape", "sigma_centre", "sigma_turn")
-COLUMNS = (*BEFORE, *COUNTS, *DEVIATIONS)
-LAYOUT_MORE = "label seen fused reason sigma_e1 sigma_e2 sigma_c1 sigma_c2 sigma_c3 sigma_r1 sigma_r2 sigma_r3"
+COLUMNS = (*BEFORE, *COUNTS, *DEVIATIONS, "taper")
+LAYOUT_MORE = "label seen fused reason sigma_e1 sigma_e2 sigma_c1 sigma_c2 sigma_c3 sigma_r1 sigma_r2 sigma_r3 kx ky"
 LAYOUT_1 = "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status"
 
 
@@ -47,6 +47,7 @@ def some(count: int, rng: np.random.Generator) -> SuperquadricArray:
         sigma_shape=rng.random((count, 2)),
         sigma_centre=rng.random((count, 3)) * 1e-3,
         sigma_turn=rng.random((count, 3)),
+        taper=rng.uniform(-0.9, 0.9, (count, 2)),
     )
 
 
@@ -79,19 +80,20 @@ def test_one_body_reads_by_hand() -> None:
         sigma_shape=np.array([[0.25, 0.5]]),
         sigma_centre=np.array([[1.5, 2.5, 3.5]]),
         sigma_turn=np.array([[0.5, 0.25, 0.125]]),
+        taper=np.array([[0.5, -0.25]]),
     )
     message = superquadrics.to_message(body, HEADER)
     assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
         HEADER,
         1,
         1,
-        124,
-        124,
+        132,
+        132,
     )
-    numbers = struct.unpack("<17f6I8f", message.data.tobytes())
+    numbers = struct.unpack("<17f6I10f", message.data.tobytes())
     before = (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
-    assert numbers == (*before, 12, 3, 1, 4 + 8, 0.25, 0.5, 1.5, 2.5, 3.5, 0.5, 0.25, 0.125)
-    assert [field.offset for field in message.fields] == list(range(0, 124, 4))
+    assert numbers == (*before, 12, 3, 1, 4 + 8, 0.25, 0.5, 1.5, 2.5, 3.5, 0.5, 0.25, 0.125, 0.5, -0.25)
+    assert [field.offset for field in message.fields] == list(range(0, 132, 4))
     assert message.is_dense
 
 
@@ -111,6 +113,7 @@ def test_a_cloud_of_release_0_2_0_is_read(rng: np.random.Generator) -> None:
         np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
     for column in COUNTS:
         np.testing.assert_array_equal(getattr(after, column), np.zeros(3, np.uint32))
+    np.testing.assert_array_equal(after.taper, np.zeros((3, 2)))
     for column in DEVIATIONS:
         assert getattr(after, column).shape == getattr(before, column).shape
         assert np.isnan(getattr(after, column)).all()
@@ -142,7 +145,7 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
         "names": ["extra", *names],
         "formats": [">f4"] + [">u4" if name in ("id", "status", *COUNTS) else ">f8" for name in names],
         "offsets": [0] + [4 + 9 * k for k in range(len(names))],
-        "itemsize": 300,
+        "itemsize": 320,
     })  # fmt: skip
     points = np.zeros(4, layout)
     flat = np.column_stack([bodies.translation, bodies.rotation, bodies.size, bodies.shape, bodies.score,
@@ -151,10 +154,10 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
         points[name] = flat[:, k]
     for name in ("id", "status", *COUNTS):
         points[name] = getattr(bodies, name)
-    more = np.column_stack([getattr(bodies, name) for name in DEVIATIONS])
-    for k, (name, _) in enumerate(FIELDS[-8:]):
+    more = np.column_stack([getattr(bodies, name) for name in (*DEVIATIONS, "taper")])
+    for k, (name, _) in enumerate(FIELDS[-10:]):
         points[name] = more[:, k]
-    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=300, row_step=605)
+    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=320, row_step=645)
     for name in layout.names:
         kind = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64, "u4": PointField.UINT32}[layout[name].str[1:]]
         message.fields.append(PointField(name=name, offset=layout.fields[name][1], datatype=kind, count=1))
@@ -175,7 +178,7 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
     elif change == "unknown type":
         message.fields[3].datatype = 77
     elif change == "outside":
-        message.fields[5].offset = 122
+        message.fields[5].offset = 130
     elif change == "cut":
         message.data = message.data[:-1]
     elif change == "short row":
@@ -192,9 +195,9 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
         ("no field", "missing: x y z"),
         ("two in one", "field qx: expected one number"),
         ("unknown type", "field qx: expected one number, got datatype 77"),
-        ("outside", "field qz: offset 122 lies outside a point of 124 bytes"),
-        ("cut", "372 bytes, got 371"),
-        ("short row", "at least 372 bytes, got 100"),
+        ("outside", "field qz: offset 130 lies outside a point of 132 bytes"),
+        ("cut", "396 bytes, got 395"),
+        ("short row", "at least 396 bytes, got 100"),
         ("nan", "translation: expected finite"),
     ],
 )
