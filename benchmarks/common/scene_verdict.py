@@ -191,12 +191,14 @@ def answer(
     turn, place = placed.rotation, placed.translation
     iou = placed.thing.columns.iou(body.transformed(quaternions.from_matrix(turn.T), -turn.T @ place))
     excess = body.support(scene.table.T) + body.support(-scene.table.T) - np.ptp(hull @ scene.table, axis=0)
+    axes = body.rotation_matrix.T
+    half = 0.5 * (body.support(axes) + body.support(-axes))
     covered = np.full(3, np.nan)
     if sigma is not None and np.isfinite(sigma).all():
         extent = np.ptp(hull @ body.rotation_matrix, axis=0) / 2
-        covered = (np.abs(body.size - extent) <= 2 * sigma).astype(float)
-    errors = np.sort(2 * body.size) - placed.thing.edges
-    return Answer(iou, errors, excess, covered, status, message, np.array(body.to_flat(), dtype=float))
+        covered = (np.abs(half - extent) <= 2 * sigma).astype(float)
+    errors = np.sort(2 * half) - placed.thing.edges
+    return Answer(iou, errors, excess, covered, status, message, np.array(body.to_numbers(), dtype=float))
 
 
 def matches(own: np.ndarray, true: np.ndarray, depth: np.ndarray) -> dict[int, int]:

@@ -1,9 +1,9 @@
 """What the cost of every fit is made of: its terms, its losses, and the normal equations J^T J and J^T r; compiled.
 
-The normal equations are summed over blocks of residuals.  A block is an array (12, LANES): rows 0 to 10 hold the
-derivatives of each residual by the 11 entries of a step (see :mod:`sq_perception.fitting.residuals`), row 11 the
+The normal equations are summed over blocks of residuals.  A block is an array (14, LANES): rows 0 to 12 hold the
+derivatives of each residual by the 13 entries of a step (see :mod:`sq_perception.fitting.residuals`), row 13 the
 residuals themselves, all times the square root of their weight.  Its outer product, lower triangle, adds to ``sums``
-(12, 12): J^T J in rows 0 to 10, J^T r in row 11.  Summing over a block at a time keeps the inner loop long and free of
+(14, 14): J^T J in rows 0 to 12, J^T r in row 13.  Summing over a block at a time keeps the inner loop long and free of
 branches, which is what vectorises.
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 from sq_perception.geometry.elementary import log2
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
-STEP_LENGTH = 11
+STEP_LENGTH, PARAMETERS = 13, 10
 LANES = 64
 """Residuals of a block: eight of the longest vectors, with all rows in the nearest cache (6 of its 32 KiB or more)."""
 _SMALL = 1e-300
@@ -52,6 +52,7 @@ class Terms(NamedTuple):
     expected: np.ndarray = np.ones(3)
     expectation_stiffness: float = 0.0
     volume_price: float = 0.0
+    taper_stiffness: float = 0.0
     hull_directions: np.ndarray = np.empty((0, 3))
     hull_support: np.ndarray = np.empty(0)
     hull_root: np.ndarray = np.empty((0, 0))
@@ -95,7 +96,7 @@ def add_block(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
 
 @kernel
 def add_row(row: np.ndarray, sums: np.ndarray) -> None:
-    """Add the outer product of a single residual's row (12,)."""
+    """Add the outer product of a single residual's row (14,)."""
     for k in range(STEP_LENGTH + 1):
         for j in range(k + 1):
             sums[k, j] += row[k] * row[j]

@@ -33,6 +33,8 @@ from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 
+UNTAPERED = 11
+"""Entries of a step without those of the taper: what a covariance is of."""
 WEAK_SHARE = 0.15
 """Standard deviation of a half size, as a share of it, above which it is called undetermined."""
 _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
@@ -42,6 +44,7 @@ _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: HullPrior | None = None) -> np.ndarray:
     """Covariance (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
 
+    (13, 13), of the tapers too, where the terms let bodies taper.
     ``outline`` is the standard deviation of the outline, metres, ``hull`` the prediction that the terms hold.
     """
     stride = max(1, len(rays.hits) // SAMPLE)
@@ -50,15 +53,17 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
     prior = (
         np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3) ** 2
     )
+    unknowns = len(prior) if terms.taper_stiffness == 0.0 else STEP_LENGTH
+    prior = np.append(prior, np.zeros(STEP_LENGTH - len(prior)))  # that of the taper is among the terms
     freedom = math.inf if hull is None else float(hull.freedom)  # an int would have it compiled again
     hits, free = rays.every(stride).weighing(stride)
     others = terms._replace(hull_directions=terms.hull_directions[:0])
     information = _information(hits, free, others, terms, state.parameters, state.rotation, prior, freedom)
-    covariance = _inverse(information, float(prior.min()))
-    units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
+    covariance = _inverse(information[:unknowns, :unknowns], float(prior[:11].min()))
+    units = np.concatenate([state.parameters[:3], np.ones(unknowns - 3)])
     covariance = units[:, None] * covariance * units
     covariance = (covariance + covariance.T) / 2
-    return covariance if hull is None else covariance + _beside(state, terms)
+    return covariance if hull is None else covariance + _beside(state, terms, unknowns)
 
 
 @kernel
@@ -72,7 +77,7 @@ def _information(
     prior: np.ndarray,
     freedom: float,
 ) -> np.ndarray:
-    """The inverse (11, 11) of the covariance, with ``prior`` (11,) the diagonal of P and ``freedom`` nu.
+    """The inverse (13, 13) of the covariance, with ``prior`` (13,) the diagonal of P and ``freedom`` nu.
 
     ``others`` are the terms without the hull.
     """
@@ -105,8 +110,8 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     return np.asarray((axes / np.maximum(values, least)) @ axes.T)
 
 
-def _beside(state: State, terms: Terms) -> np.ndarray:
-    """Second moments (11, 11) of sizes and centre that a body's distance to a predicted hull adds.
+def _beside(state: State, terms: Terms, unknowns: int) -> np.ndarray:
+    """Second moments (unknowns, unknowns) of sizes and centre that a body's distance to a predicted hull adds.
 
     The body does not match the hull of a thing that is no superquadric, nor a wrong prediction.  Each end of an axis
     errs by the differences in the directions near to it: whether both ends do so alike or apart, neither half their
@@ -115,7 +120,7 @@ def _beside(state: State, terms: Terms) -> np.ndarray:
     near = near_axes(terms.hull_directions, state.rotation)
     off = hull_distances(terms, state.parameters, state.rotation)
     square = off**2 @ near / near.sum(axis=0)
-    moments = np.zeros((STEP_LENGTH, STEP_LENGTH))
+    moments = np.zeros((unknowns, unknowns))
     moments[0:3, 0:3] = np.diag(square)
     moments[5:8, 5:8] = (state.rotation * square) @ state.rotation.T
     return moments
@@ -136,10 +141,10 @@ def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
     Sizes are compared along the axes of the body, exponents between bodies with the same z axis.  What an alternative
     is unsure of itself joins for sizes and places.
     """
-    moments = np.zeros((STEP_LENGTH, STEP_LENGTH))
+    moments = np.zeros((UNTAPERED, UNTAPERED))
     for other, weight, own in alternatives:
         partner = np.abs(state.rotation.T @ other.rotation).argmax(axis=1)
-        difference = np.zeros(STEP_LENGTH)
+        difference = np.zeros(UNTAPERED)
         difference[0:3] = other.parameters[partner] - state.parameters[0:3]
         if partner[2] == 2:
             difference[3:5] = other.parameters[3:5] - state.parameters[3:5]
@@ -154,7 +159,7 @@ def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
 def carried_over(covariance: np.ndarray, body: Superquadric, form: Superquadric) -> np.ndarray:
     """The covariance in another of the body's 8 forms: axes exchange and reverse."""
     turn = np.round(body.rotation_matrix.T @ form.rotation_matrix)
-    change = np.eye(STEP_LENGTH)
+    change = np.eye(UNTAPERED)
     change[0:3, 0:3] = np.abs(turn).T
     change[8:11, 8:11] = turn.T
     return change @ covariance @ change.T

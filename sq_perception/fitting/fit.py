@@ -51,6 +51,8 @@ class Fit:
         free space, the support plane, symmetry and what bodies mostly are.
     covariance
         (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
+    sigma_taper
+        Standard deviations (2,) of the tapers; 0 where the body was not to taper.
     iterations, milliseconds
         What the fit cost.
     is_predicted
@@ -68,6 +70,7 @@ class Fit:
     inlier_share: float = math.nan
     seen: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
     covariance: np.ndarray = field(default_factory=lambda: np.full((11, 11), np.nan))
+    sigma_taper: np.ndarray = field(default_factory=lambda: np.zeros(2))
     iterations: int = 0
     milliseconds: float = 0.0
     is_predicted: bool = False

@@ -4,8 +4,8 @@ A block is an array ``lanes`` (ROWS, LANES), one ray per column, its values in t
 frame.  Every line of the mathematics is a loop over the block without a branch, which the compiler turns into vector
 code.  Lanes in use are a multiple of a vector's length (:func:`padded`): one lane takes as long as eight.
 
-The gauge g is convex along a ray.  Where the ray enters the body, g = 1 with a falling slope, is found by Newton's
-method; how near a ray that misses passes, by a bracket around the smallest g.
+The gauge g is convex along a ray, or nearly so for bodies that taper.  Where the ray enters the body, g = 1 with a
+falling slope, is found by Newton's method; how near a ray that misses passes, by a bracket around the smallest g.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ import numpy as np
 
 from sq_perception.fitting.cost import LANES, Terms
 from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
-from sq_perception.geometry.kernels import box_interval, gauge_derivatives, in_object_frame, inline_kernel, kernel
+from sq_perception.geometry.kernels import Form, gauge_derivatives, in_object_frame, inline_kernel, inside_box, kernel
 
 QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)
 """Rows of a ray in the object frame, q + shift e."""
-G, GX, GY, GZ, G1, G2, SLOPE = range(7, 14)
+G, GX, GY, GZ, G1, G2, GK1, GK2, SLOPE = range(7, 16)
 """Rows of the gauge there and its derivatives, the last one along the ray."""
-MEASURED, PRECISION, SHARE, START = range(14, 18)
+MEASURED, PRECISION, SHARE, START = range(16, 20)
 """Rows of what the pixel measured, 1 / sigma and weight of the ray, and the depth of q."""
-LOW, HIGH, G_LOW, G_HIGH, S_LOW, S_HIGH = range(18, 24)
+LOW, HIGH, G_LOW, G_HIGH, S_LOW, S_HIGH = range(20, 26)
 """Rows of a bracket around the smallest gauge."""
-ROWS = 24
+ROWS = 26
 _VECTOR = 8
 """Doubles of the longest vectors of today's processors, 512 bits."""
 
@@ -75,16 +75,22 @@ def padded(count: int, lanes: np.ndarray) -> int:
     return filled
 
 
+@inline_kernel
+def form_of(parameters: np.ndarray) -> Form:
+    """The sizes, exponents and tapers of ``parameters``."""
+    return parameters[0], parameters[1], parameters[2], parameters[3], parameters[4], parameters[8], parameters[9]
+
+
 @kernel
 def gauge_along(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
     """Write the gauge and its derivatives at q + shift e to the lanes."""
-    a1, a2, a3, e1, e2 = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
+    a1, a2, a3, e1, e2, k1, k2 = form_of(parameters)
     for i in range(filled):
         ex, ey, ez, shift = lanes[EX, i], lanes[EY, i], lanes[EZ, i], lanes[SHIFT, i]
         x, y, z = lanes[QX, i] + shift * ex, lanes[QY, i] + shift * ey, lanes[QZ, i] + shift * ez
-        g, gx, gy, gz, g1, g2, _, _ = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, 0.0, 0.0)
+        g, gx, gy, gz, g1, g2, gk1, gk2 = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, k1, k2)
         lanes[G, i], lanes[GX, i], lanes[GY, i], lanes[GZ, i] = g, gx, gy, gz
-        lanes[G1, i], lanes[G2, i] = g1, g2
+        lanes[G1, i], lanes[G2, i], lanes[GK1, i], lanes[GK2, i] = g1, g2, gk1, gk2
         lanes[SLOPE, i] = gx * ex + gy * ey + gz * ez
 
 
@@ -139,8 +145,7 @@ def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes:
     for i in range(filled):
         qx, qy, qz = lanes[QX, i], lanes[QY, i], lanes[QZ, i]
         ex, ey, ez = lanes[EX, i], lanes[EY, i], lanes[EZ, i]
-        half = parameters[0], parameters[1], parameters[2]
-        t_in, t_out = box_interval((qx, qy, qz), (ex, ey, ez), half)
+        t_in, t_out = inside_box((qx, qy, qz), (ex, ey, ez), form_of(parameters))
         inside = t_in <= t_out
         lanes[SHARE, i] = 1.0 if inside else 0.0
         lanes[SHIFT, i] = lanes[LOW, i] = t_in if inside else 0.0
@@ -176,7 +181,7 @@ def enter(
     x, y, z = ray[ORIGIN_X] - parameters[5], ray[ORIGIN_Y] - parameters[6], -parameters[7]
     origin = in_object_frame(rotation, x, y, z)
     way = in_object_frame(rotation, ray[DIRECTION_X], ray[DIRECTION_Y], 1.0)
-    t_in, t_out = box_interval(origin, way, (parameters[0], parameters[1], parameters[2]))
+    t_in, t_out = inside_box(origin, way, form_of(parameters))
     low = max(t_in, _NEAREST if terms.pinhole > 0.0 else -1e300)
     high = min(t_out, ray[DEPTH])
     if low >= high:

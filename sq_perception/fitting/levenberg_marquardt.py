@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.cost import STEP_LENGTH, Terms
+from sq_perception.fitting.cost import PARAMETERS, STEP_LENGTH, Terms
 from sq_perception.fitting.residuals import evaluate
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import inline_kernel, kernel
@@ -36,7 +36,7 @@ _LEAST_COST = 1e-12
 class State(NamedTuple):
     """A body inside the optimiser.
 
-    ``parameters`` (8,): a1 a2 a3 e1 e2 t1 t2 t3, ``rotation`` (3, 3) object to optical frame, ``cost`` there,
+    ``parameters`` (10,): a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y, ``rotation`` (3, 3) object to optical frame, ``cost`` there,
     ``iterations`` spent so far.
     """
 
@@ -48,14 +48,14 @@ class State(NamedTuple):
     @classmethod
     def of(cls, body: Superquadric) -> State:
         """The state of a single body, its cost unknown."""
-        flat = np.array(body.to_flat(), dtype=float)
-        return cls(flat[:8], np.ascontiguousarray(body.rotation_matrix, dtype=float), math.inf, 0)
+        parameters = np.concatenate([body.size, body.shape, body.translation, body.taper]).astype(float)
+        return cls(parameters, np.ascontiguousarray(body.rotation_matrix, dtype=float), math.inf, 0)
 
     @property
     def body(self) -> Superquadric:
         """The body, in whichever of its forms the optimiser reached."""
         p = self.parameters
-        return Superquadric(p[0:3], p[3:5], p[5:8], quaternions.from_matrix(self.rotation))
+        return Superquadric(p[0:3], p[3:5], p[5:8], quaternions.from_matrix(self.rotation), p[8:10])
 
 
 @kernel
@@ -125,11 +125,12 @@ def _promised(sums: np.ndarray, step: np.ndarray) -> float:
 @kernel
 def _hold(parameters: np.ndarray, lower: np.ndarray, upper: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> None:
     """Mark the parameters that sit on a bound and would be pushed beyond it."""
-    for k in range(8):
+    for k in range(PARAMETERS):
+        entry = k if k < 8 else k + 3
         slack = 1e-12 * max(abs(lower[k]), abs(upper[k]))
-        at_lower = parameters[k] <= lower[k] + slack and gradient[k] > 0.0
-        at_upper = parameters[k] >= upper[k] - slack and gradient[k] < 0.0
-        held[k] = at_lower or at_upper
+        at_lower = parameters[k] <= lower[k] + slack and gradient[entry] > 0.0
+        at_upper = parameters[k] >= upper[k] - slack and gradient[entry] < 0.0
+        held[entry] = at_lower or at_upper or lower[k] == upper[k]
 
 
 @kernel
@@ -137,7 +138,7 @@ def solve_damped(sums: np.ndarray, damping: float, held: np.ndarray, factor: np.
     """Cholesky solution of the damped normal equations, laid out as by ``evaluate``; False if they are not positive."""
     largest = 0.0
     for k in range(STEP_LENGTH):
-        largest = max(largest, sums[k, k])
+        largest = largest if held[k] else max(largest, sums[k, k])
     if not largest > 0.0:
         return False
     for i in range(STEP_LENGTH):
@@ -179,13 +180,14 @@ def move(
     next_parameters: np.ndarray,
     next_rotation: np.ndarray,
 ) -> None:
-    """Apply a clipped step: sizes multiply, shape and centre add, the rotation turns about its own axes."""
+    """Apply a clipped step: sizes multiply, shape, centre and taper add, the rotation turns about its own axes."""
     largest_size = max(parameters[0], parameters[1], parameters[2])
-    for k in range(8):
+    for k in range(PARAMETERS):
         if k < 3:
             value = parameters[k] * math.exp(min(max(step[k], -_LONGEST_LOG_SIZE), _LONGEST_LOG_SIZE))
-        elif k < 5:
-            value = parameters[k] + min(max(step[k], -_LONGEST_SHAPE), _LONGEST_SHAPE)
+        elif k < 5 or k >= 8:
+            along = step[k] if k < 5 else step[k + 3]
+            value = parameters[k] + min(max(along, -_LONGEST_SHAPE), _LONGEST_SHAPE)
         else:
             value = parameters[k] + min(max(step[k], -largest_size), largest_size)
         next_parameters[k] = min(max(value, lower[k]), upper[k])

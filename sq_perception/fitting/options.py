@@ -17,6 +17,8 @@ LARGEST_SIZE = 2.0
 """Largest size, likewise: a body may hide as much again as it shows."""
 EXPONENTS = (0.1, 1.0)
 """Least and largest exponent of a fit: from boxes to ellipsoids, as in the thesis."""
+TAPER = 0.8
+"""Largest taper of a fit, where bodies may taper: beyond, a bottle would be a cone."""
 MIN_PIXELS = 12
 """Fewest pixels of an object with a depth: a body has 11 parameters."""
 MODEL_ERROR = 0.0025
@@ -24,13 +26,13 @@ MODEL_ERROR = 0.0025
 
 
 def limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3 for observed points (n, 3)."""
+    """Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y for observed points (n, 3); without a taper."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent = max(float(np.linalg.norm(high - low)), 1e-9)
     smallest, largest = SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2
     reach = math.sqrt(3.0) * max(extent, largest)  # no point of a body is farther from its centre
-    lower = np.array([*[smallest] * 3, *[EXPONENTS[0]] * 2, *(low - reach)])
-    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(high + reach)])
+    lower = np.array([*[smallest] * 3, *[EXPONENTS[0]] * 2, *(low - reach), 0.0, 0.0])
+    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(high + reach), 0.0, 0.0])
     return lower, upper
 
 

@@ -1,7 +1,6 @@
 """What is known of a body beyond its image: a support plane, and how bodies mostly are; compiled.
 
-plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R^T n), h the support function, which is
-            the gauge's dual norm: two nested p-norms of a n with exponents 2 - e.
+plane       (lowest point above the plane) / sigma where negative: n.t + d - h(-R^T n), h the support function.
 gap         as ``plane`` where positive, another sigma, Cauchy: bodies do not hover, unless they stand on other things.
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
@@ -9,6 +8,7 @@ expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a p
 roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
 hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions against a predicted one b, whitened by
             W^T W, the inverse of its covariance (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).
+taper       k_x and k_y over their standard deviation: most things do not taper.
 volume      a linear price on log(a1 a2 a3), which prefers the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
@@ -22,10 +22,8 @@ import math
 import numpy as np
 
 from sq_perception.fitting.cost import STEP_LENGTH, Terms, add_block, add_row
-from sq_perception.geometry.kernels import conjugate, inline_kernel, kernel, p_norm
-
-Derivatives = tuple[float, float, float, float, float, float]
-"""h and its derivatives by x, y, z, e1 and e2."""
+from sq_perception.fitting.intersection import form_of
+from sq_perception.geometry.kernels import kernel, profile_sines, support_at, support_derivatives
 
 
 @kernel
@@ -42,6 +40,12 @@ def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
         cost += _roundness_cost(terms, parameters, sums)
     if terms.hull_directions.shape[0] > 0:
         cost += hull_cost(terms, parameters, rotation, sums)
+    if terms.taper_stiffness > 0.0:
+        for k in range(2):
+            slope = terms.taper_stiffness * terms.taper_stiffness * parameters[8 + k]
+            cost += slope * parameters[8 + k]
+            sums[11 + k, 11 + k] += terms.taper_stiffness * terms.taper_stiffness
+            sums[STEP_LENGTH, 11 + k] += slope
     if terms.volume_price > 0.0:
         for k in range(3):
             cost += terms.volume_price * math.log(parameters[k])
@@ -49,33 +53,17 @@ def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
     return cost
 
 
-@inline_kernel
-def support_derivatives(
-    nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float
-) -> Derivatives:
-    """Support function h at an object-frame direction and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2."""
-    inner, inner_x, inner_y, inner_e = p_norm(a1 * abs(nx), a2 * abs(ny), conjugate(e2))
-    h, h_inner, h_z, h_e = p_norm(inner, a3 * abs(nz), conjugate(e1))
-    return (
-        h,
-        math.copysign(h_inner * inner_x * a1, nx),
-        math.copysign(h_inner * inner_y * a2, ny),
-        math.copysign(h_z * a3, nz),
-        -h_e,
-        -h_inner * inner_e,
-    )
-
-
 @kernel
 def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    a1, a2, a3, e1, e2, k1, k2 = form_of(parameters)
+    t1, t2, t3 = parameters[5], parameters[6], parameters[7]
     normal = terms.plane[:3]
     n = np.zeros(3)
     for k in range(3):
         n[k] = rotation[0, k] * normal[0] + rotation[1, k] * normal[1] + rotation[2, k] * normal[2]
     cost = 0.0
     row = np.zeros(STEP_LENGTH + 1)
-    h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
+    h, hx, hy, hz, h1, h2, hk1, hk2 = support_derivatives(-n[0], -n[1], -n[2], a1, a2, a3, e1, e2, k1, k2)
     lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + terms.plane[3] - h
     s = terms.plane_stiffness if lowest < 0.0 else terms.gap_stiffness
     if s > 0.0:
@@ -87,12 +75,12 @@ def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, su
             cost += math.log1p(square)
             s /= math.sqrt(1.0 + square)
             residual /= math.sqrt(1.0 + square)
-        row[0], row[1], row[2] = -s * hx * n[0], -s * hy * n[1], -s * hz * n[2]
-        row[3], row[4] = -s * h1, -s * h2
+        row[0], row[1], row[2] = s * hx * n[0], s * hy * n[1], s * hz * n[2]
+        row[3], row[4], row[11], row[12] = -s * h1, -s * h2, -s * hk1, -s * hk2
         row[5], row[6], row[7] = s * normal[0], s * normal[1], s * normal[2]
-        row[8] = -s * (hy * n[2] - hz * n[1])
-        row[9] = -s * (hz * n[0] - hx * n[2])
-        row[10] = -s * (hx * n[1] - hy * n[0])
+        row[8] = s * (hy * n[2] - hz * n[1])
+        row[9] = s * (hz * n[0] - hx * n[2])
+        row[10] = s * (hx * n[1] - hy * n[0])
         row[STEP_LENGTH] = residual
         add_row(row, sums)
     if terms.rest_stiffness > 0.0:
@@ -143,20 +131,27 @@ def _hull_rows(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np
     for j in range(count):
         rows[5, j], rows[6, j], rows[7, j] = terms.hull_directions[j]
         rows[STEP_LENGTH, j] = -terms.hull_support[j]
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    a1, a2, a3, e1, e2, k1, k2 = form_of(parameters)
+    t1, t2, t3 = parameters[5], parameters[6], parameters[7]
     m11, m12, m13 = rotation[0]
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
+    turned = np.empty((3, count))
     for j in range(count):
         d0, d1, d2 = rows[5, j], rows[6, j], rows[7, j]
-        n0 = m11 * d0 + m21 * d1 + m31 * d2
-        n1 = m12 * d0 + m22 * d1 + m32 * d2
-        n2 = m13 * d0 + m23 * d1 + m33 * d2
-        h, hx, hy, hz, h1, h2 = support_derivatives(n0, n1, n2, a1, a2, a3, e1, e2)
+        turned[0, j] = m11 * d0 + m21 * d1 + m31 * d2
+        turned[1, j] = m12 * d0 + m22 * d1 + m32 * d2
+        turned[2, j] = m13 * d0 + m23 * d1 + m33 * d2
+    is_tapered = k1 != 0.0 or k2 != 0.0
+    sines = profile_sines(turned, form_of(parameters)) if is_tapered else np.zeros(count)
+    for j in range(count):
+        n0, n1, n2 = turned[0, j], turned[1, j], turned[2, j]
+        h, hx, hy, hz, h1, h2, hk1, hk2 = support_at(sines[j], n0, n1, n2, a1, a2, a3, e1, e2, k1, k2)
+        rows[11, j], rows[12, j] = hk1, hk2
         rows[0, j], rows[1, j], rows[2, j] = hx * n0, hy * n1, hz * n2
         rows[3, j], rows[4, j] = h1, h2
         rows[8, j], rows[9, j], rows[10, j] = hy * n2 - hz * n1, hz * n0 - hx * n2, hx * n1 - hy * n0
-        rows[STEP_LENGTH, j] += d0 * t1 + d1 * t2 + d2 * t3 + h
+        rows[STEP_LENGTH, j] += rows[5, j] * t1 + rows[6, j] * t2 + rows[7, j] * t3 + h
     return rows
 
 

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from sq_perception.fitting.cost import Terms
-from sq_perception.fitting.covariance import Alternative, covariance_at
+from sq_perception.fitting.covariance import UNTAPERED, Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import ON_SUPPORT, Observation
@@ -70,6 +70,10 @@ VOLUME_PRICE = 0.5
 """Price of log(a1 a2 a3) in the cost: what the image does not determine is not to grow.  Chosen on scanned objects."""
 
 
+class PlaneError(ValueError):
+    """A support plane that most of the object lies behind."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """One object to fit.
@@ -83,7 +87,7 @@ class Problem:
     terms
         Constants of the residuals and priors.
     limits
-        Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3.
+        Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y.
     deadline
         ``time.perf_counter`` after which nothing new is tried.
     independent
@@ -110,14 +114,14 @@ class Problem:
 
         Raises
         ------
-        ValueError
+        PlaneError
             If most of the object lies behind its support, as where the normal of that has the wrong sign.
         """
         if options.plane is not None:
             height = quantile(observation.points @ options.plane[:3] + options.plane[3], 0.5)
             if height < -ON_SUPPORT:
                 turned = "is it what this object stands on, and does its normal n point away from that?"
-                raise ValueError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
+                raise PlaneError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
         terms, bounds = terms_of(observation, options), limits(observation.points)
         return cls(observation, options, terms, bounds, began + options.time_budget)
 
@@ -135,6 +139,12 @@ class Problem:
     def with_terms(self, **changed: float) -> Problem:
         """The problem with some terms changed."""
         return replace(self, terms=Terms(**{**self.terms._asdict(), **changed}))
+
+    def within(self, taper: float) -> Problem:
+        """The problem with tapers up to a limit."""
+        lower, upper = (limit.copy() for limit in self.limits)
+        lower[8:], upper[8:] = -taper, taper
+        return replace(self, limits=(lower, upper))
 
     def without_hull(self) -> Problem:
         """The problem as if no hull had been predicted."""
@@ -245,6 +255,16 @@ class Solution:
     @cached_property
     def covariance(self) -> np.ndarray:
         """Covariance (11, 11) from the valley of the cost around the body and its distance to a predicted hull."""
+        return np.ascontiguousarray(self._with_taper[:UNTAPERED, :UNTAPERED])
+
+    @property
+    def taper_covariance(self) -> np.ndarray:
+        """Covariance (2, 2) of the tapers; 0 where the body may not taper."""
+        found = self._with_taper[UNTAPERED:, UNTAPERED:]
+        return np.ascontiguousarray(found) if len(found) else np.zeros((2, 2))
+
+    @cached_property
+    def _with_taper(self) -> np.ndarray:
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
         return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
 

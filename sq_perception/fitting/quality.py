@@ -32,6 +32,8 @@ def assessed(solution: Solution, began: float) -> Fit:
     body = state.body
     covariance = solution.covariance + spread(state, solution.alternatives)
     canonical = body.canonical_form()
+    is_exchanged = abs(body.rotation_matrix[:, 0] @ canonical.rotation_matrix[:, 0]) < 0.5
+    sigma_taper = np.sqrt(np.diag(solution.taper_covariance))
     covariance = carried_over(covariance, body, canonical)
     if solution.is_unfinished:  # it holds at the lowest point of a valley, where the body is not
         covariance = np.full_like(covariance, np.nan)
@@ -53,6 +55,7 @@ def assessed(solution: Solution, began: float) -> Fit:
         inlier_share=inlier_share,
         seen=seen_extents(canonical, observation.points),
         covariance=covariance,
+        sigma_taper=sigma_taper[::-1] if is_exchanged else sigma_taper,
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
         is_predicted=solution.problem.hull is not None,

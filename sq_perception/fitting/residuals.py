@@ -2,11 +2,12 @@
 
 Unknowns
 --------
-A body is ``parameters`` = (a1 a2 a3 e1 e2 t1 t2 t3) and a matrix ``rotation`` R, object to optical frame.  A step has
-11 entries: d log a (3), d e (2), d t (3) and a rotation vector w in the object frame, R <- R exp([w]).  At a fixed
+A body is ``parameters`` = (a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y) and a matrix ``rotation`` R, object to optical frame.  A
+step has 13 entries: d log a (3), d e (2), d t (3), a rotation vector w in the object frame, R <- R exp([w]), and d k
+(2).  At a fixed
 point p of the optical frame, with q = R^T (p - t) in the object frame, the gauge g(q) and its gradient g_q,
 
-    dg/d log a_k = -q_k g_k,    dg/de from the kernel,    dg/dt = -R g_q,    dg/dw = g_q x q.
+    dg/d log a_k = -q_k g_k,    dg/de, dg/dk from the kernel,    dg/dt = -R g_q,    dg/dw = g_q x q.
 
 Residuals
 ---------
@@ -41,6 +42,8 @@ from sq_perception.fitting.intersection import (
     EZ,
     G1,
     G2,
+    GK1,
+    GK2,
     GX,
     GY,
     GZ,
@@ -83,7 +86,7 @@ def evaluate(
     rotation: np.ndarray,
     sums: np.ndarray,
 ) -> float:
-    """Cost at a body; fills ``sums`` (12, 12), lower triangle: J^T J in rows 0 to 10, J^T r in row 11.
+    """Cost at a body; fills ``sums`` (14, 14), lower triangle: J^T J in rows 0 to 12, J^T r in row 13.
 
     The RENDERED stage keeps in the column LAST of ``rays`` where each ray met the body.
     """
@@ -183,7 +186,7 @@ def _measured_rows(
 
 @kernel
 def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: np.ndarray) -> None:
-    """Write the derivatives of scale * g by a step to rows 0 to 10 of the block; its first row holds the scale."""
+    """Write the derivatives of scale * g by a step to rows 0 to 12 of the block; its first row holds the scale."""
     m11, m12, m13 = rotation[0]
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
@@ -201,6 +204,7 @@ def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: 
         block[8, i] = gy * z - gz * y
         block[9, i] = gz * x - gx * z
         block[10, i] = gx * y - gy * x
+        block[11, i], block[12, i] = scale * lanes[GK1, i], scale * lanes[GK2, i]
 
 
 @kernel

@@ -144,5 +144,5 @@ def _round(
     half = max(float(0.5 * (along[1] - along[0])), 1e-4)
     centre = 0.5 * (along[0] + along[1]) * axis + 0.5 * (across[0] + across[1]) * side + (nearest + radius) * away
     rotation = np.ascontiguousarray(np.stack([side, quaternions.cross(axis, side), axis], axis=1))
-    parameters = np.concatenate([[radius, radius, half, _START_EXPONENT, 1.0], centre])
+    parameters = np.concatenate([[radius, radius, half, _START_EXPONENT, 1.0], centre, [0.0, 0.0]])
     return State(parameters, rotation, math.inf, 0)

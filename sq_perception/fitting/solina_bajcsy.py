@@ -137,4 +137,4 @@ def moment_start(points: np.ndarray) -> State:
         axes[:, 0] *= -1
     half = np.ptp(centred @ axes, axis=0) / 2
     half = np.maximum(half, max(1e-3 * float(half.max()), 1e-6))
-    return State(np.concatenate([half, [1.0, 1.0], centroid]), np.ascontiguousarray(axes), math.inf, 0)
+    return State(np.concatenate([half, [1.0, 1.0], centroid, [0.0, 0.0]]), np.ascontiguousarray(axes), math.inf, 0)

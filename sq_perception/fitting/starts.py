@@ -29,6 +29,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from sq_perception.fitting.cost import PARAMETERS
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation, span
 from sq_perception.geometry import rotation as quaternions
@@ -129,9 +130,10 @@ def _axes_of(points: np.ndarray) -> np.ndarray:
 
 def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]:
     """The box from ``low`` to ``high`` along the axes (columns), for each choice of z."""
-    parameters = np.full((len(ORDERS), 8), _BOX_EXPONENT)
+    parameters = np.full((len(ORDERS), PARAMETERS), _BOX_EXPONENT)
     parameters[:, :3] = np.maximum((high - low) / 2, 1e-6)[ORDERS]
-    parameters[:, 5:] = axes @ ((low + high) / 2)
+    parameters[:, 5:8] = axes @ ((low + high) / 2)
+    parameters[:, 8:] = 0.0
     return [State(*each, math.inf, 0) for each in zip(parameters, three_orders(axes), strict=True)]
 
 
@@ -256,5 +258,5 @@ def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: 
     for rotation in three_orders(axes):
         spread = np.einsum("ji,jk,ki->i", rotation, moments, rotation)
         size = np.sqrt(np.maximum(spread, 1e-12) / MOMENT_SHARE)
-        found.append(State(np.concatenate([size, [exponent, exponent], centre]), rotation, math.inf, 0))
+        found.append(State(np.concatenate([size, [exponent, exponent], centre, [0.0, 0.0]]), rotation, math.inf, 0))
     return found

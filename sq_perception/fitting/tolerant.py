@@ -32,6 +32,7 @@ Metres, radians, optical frame.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -40,6 +41,7 @@ import numpy as np
 from sq_perception.fitting import revolution, unseen
 from sq_perception.fitting.fit import INLIER
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.options import TAPER
 from sq_perception.fitting.problem import (
     COARSE_RAYS,
     FINAL_RAYS,
@@ -70,6 +72,8 @@ SPREAD = 2.5**2
 """Factor of the covariance for things that are no superquadrics, as their residuals err alike.  Beside a predicted hull
 the misfit and the distance to the hull of each thing take its place: on 600 things of benchmarks/household_things,
 seeds from 3000, sigma and error then rank more alike (0.65, 0.57 with the factor), at two thirds of the sigma."""
+TAPER_SIGMA = 0.3
+"""Standard deviation of the prior of a taper: of household things bottles have the largest ones, up to 0.6."""
 _HUBER = 1.0
 """Noise levels up to which Huber's loss is quadratic: what strays farther is another part of the thing: a neck, a
 handle."""
@@ -104,8 +108,25 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     if not problem.late:
         few = drawn.draw(COARSE_RAYS, 0.7)
         settled = by_cost(drawn.in_time(settled, lambda state: drawn.settle(state, few)))
-    solution = _refined(drawn, settled)
+    solution = _straight_unless_known(_refined(drawn, settled))
+    problem = replace(problem, limits=solution.problem.limits)
+    problem = problem.with_terms(taper_stiffness=solution.problem.terms.taper_stiffness)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
+
+
+def _straight_unless_known(solution: Solution) -> Solution:
+    """The solution, its body fitted once more without a taper where the evidence is not for one.
+
+    The ratio of the evidence for k = 0 to that for any k is that of the densities of the posterior and the prior there
+    (J. M. Dickey, The weighted likelihood ratio, Annals of Mathematical Statistics 42(1), 1971): no price of parameters
+    is to be chosen.
+    """
+    problem, taper, covariance = solution.problem, solution.state.parameters[8:], solution.taper_covariance
+    known = taper @ np.linalg.solve(covariance, taper) + np.linalg.slogdet(covariance)[1]
+    if known > 4 * math.log(TAPER_SIGMA) or problem.late:
+        return solution
+    straight = problem.with_terms(taper_stiffness=0.0).within(taper=0.0)
+    return replace(solution, problem=straight, state=straight.refine(solution.state, solution.rays))
 
 
 def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
@@ -157,6 +178,8 @@ def _with_priors(problem: Problem) -> Problem:
         hull_directions=np.array(hull.directions, float, order="C"),
         hull_support=np.array(hull.support, float, order="C"),
         hull_root=hull.root(),
+        taper_stiffness=1 / TAPER_SIGMA,
     )
     observation = problem.observation.of_hull()
-    return replace(problem, terms=terms, observation=observation, independent=INDEPENDENT_OF_PREDICTED, hull=hull)
+    known = replace(problem, terms=terms, observation=observation, independent=INDEPENDENT_OF_PREDICTED, hull=hull)
+    return known.within(taper=TAPER)

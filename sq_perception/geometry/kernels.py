@@ -179,7 +179,7 @@ def gauge_derivatives(
     g, g_h, g_w, g_e = p_norm(h, abs(z) / a3, e1)
     g_x, g_y = math.copysign(g_h * h_x / a1, x) / f1, math.copysign(g_h * h_y / a2, y) / f2
     x_x, y_y = x * g_x / f1, y * g_y / f2
-    is_inside1, is_inside2 = 1.0 + k1 * (z / a3) > 1.0 - abs(k1), 1.0 + k2 * (z / a3) > 1.0 - abs(k2)
+    is_inside1, is_inside2 = 1.0 + k1 * (z / a3) >= 1.0 - abs(k1), 1.0 + k2 * (z / a3) >= 1.0 - abs(k2)
     g_z = math.copysign(g_w / a3, z) - (x_x * k1 if is_inside1 else 0.0) / a3 - (y_y * k2 if is_inside2 else 0.0) / a3
     g_k1 = -x_x * (z / a3 if is_inside1 else -math.copysign(1.0, k1))
     g_k2 = -y_y * (z / a3 if is_inside2 else -math.copysign(1.0, k2))
@@ -290,7 +290,7 @@ def support_at(
     k1: float,
     k2: float,
 ) -> Support:
-    """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; any sine will do without a taper."""
+    """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; without a taper any will do."""
     u, v = a1 * abs(nx), a2 * abs(ny)
     is_tapered = k1 != 0.0 or k2 != 0.0
     t = 0.0
@@ -310,8 +310,8 @@ def support_at(
         math.copysign(h_z, along) * a3,
         -h_e,
         -h_inner * inner_e,
-        by_u * u * t,
-        by_v * v * t,
+        by_u * u * math.copysign(h_z, along),
+        by_v * v * math.copysign(h_z, along),
     )
 
 

@@ -17,9 +17,9 @@ A tapered body (A. Barr 1984; F. Solina, R. Bajcsy, PAMI 12(2), 1990) has the ga
 
     x' = x / (1 + k_x z/a3),    y' = y / (1 + k_y z/a3),    |k| < 1:
 
-its section at z is scaled by 1 + k z/a3, from 1 - k at its lower to 1 + k at its upper end; a1 and a2 are the half sizes
-of the section in the middle.  Beyond the narrow end the scale stays that of the end.  g is then no norm, and the body
-need not be convex: for exponents up to 1 it is where k_x = k_y and |k| < 0.7, and nearly so otherwise.
+its section at z is scaled by 1 + k z/a3, from 1 - k at its lower to 1 + k at its upper end; a1 and a2 are the half
+sizes of the section in the middle.  Beyond the narrow end the scale stays that of the end.  g is then no norm, and the
+body need not be convex: for exponents up to 1 it is where k_x = k_y and |k| < 0.7, and nearly so otherwise.
 
 Each of the two p-norms, p = 2/e, is evaluated in ratio form: the larger term is factored out and the rest goes through
 log1p.  Nothing overflows down to e = 0.01, no epsilon shifts the surface, and gradients are finite on the axes.
@@ -27,8 +27,8 @@ log1p.  Nothing overflows down to e = 0.01, no epsilon shifts the surface, and g
 Conventions
 -----------
 Metres and radians; ``rotation`` is a quaternion x y z w from object to parent frame, ``translation`` the centre in the
-parent frame.  The flat order is a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw (thesis, equation 3.12); where tapers are known, k_x
-and k_y come after it.
+parent frame.  The flat order is a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw (thesis, equation 3.12); where tapers are known,
+k_x and k_y come after it.
 
 Reference: A. Jaklic, A. Leonardis, F. Solina, Segmentation and Recovery of Superquadrics, Kluwer 2000, chapter 2.
 """
@@ -185,7 +185,7 @@ class Superquadric:
         return cls.from_flat(xp.stack([body.to_numbers() for body in bodies]))
 
     def untapered(self) -> Superquadric:
-        """The bodies without their tapers, as large as their largest sections: they enclose them, in the same boxes."""
+        """The bodies without their tapers, all sections as large as at the wide end: they enclose the tapered ones."""
         return Superquadric(self.size * self._largest(), self.shape, self.translation, self.rotation)
 
     def with_taper(self, taper: Array) -> Superquadric:
@@ -194,7 +194,7 @@ class Superquadric:
         return Superquadric(self.size / shaped._largest(), self.shape, self.translation, self.rotation, taper)
 
     def _largest(self) -> Array:
-        """Half sizes (..., 3) of the box around a body, as multiples of its own half sizes."""
+        """Half sizes (..., 3) at the wide end, as multiples of those in the middle."""
         xp = array_namespace(self.size)
         return 1 + xp.concat([xp.abs(self.taper), 0 * self.taper[..., :1]], axis=-1)
 
@@ -240,7 +240,8 @@ class Superquadric:
         xp = array_namespace(points)
         high = (points[..., 2] / self.size[..., None, 2])[..., None]
         taper = self.taper[..., None, :]
-        return xp.maximum(1 + taper * high, 1 - xp.abs(taper))
+        scale, narrow = 1 + taper * high, 1 - xp.abs(taper)
+        return xp.where(scale >= narrow, scale, narrow)  # no maximum: its gradient is half where both are 1
 
     def inside_outside(self, points: Array) -> Array:
         """F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow to inf far from sharp bodies."""

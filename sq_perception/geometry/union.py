@@ -1,4 +1,4 @@
-"""Unions of superquadrics, as flat parameters (k, 12) or, where they taper, (k, 14), compiled: the support function of their hull, and motion.
+"""Unions of superquadrics, as numbers (k, 14) or, without tapers, (k, 12), compiled: the support of their hull, motion.
 
 The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  Things drawn by the
 thousand for training need it some ten times each; :class:`Superquadric` computes the same for one body at a time.

@@ -74,10 +74,8 @@ class KnownBodies:
         ValueError
             For covariances of another shape.
         """
-        flat, turns = (
-            np.ascontiguousarray(bodies.to_numbers(), dtype=float),
-            np.ascontiguousarray(bodies.rotation_matrix),
-        )
+        flat = np.ascontiguousarray(bodies.to_numbers(), dtype=float)
+        turns = np.ascontiguousarray(bodies.rotation_matrix)
         wide = np.zeros((len(flat), 9))
         wide[:, :3] = UNKNOWN * bodies.size
         wide[:, 3:6] = UNKNOWN * bodies.size.mean(axis=1, keepdims=True)
@@ -201,7 +199,8 @@ def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, c
     """Where lines from at (3, k) along way (3, k), in a body's own frame, leave it, and the cosine to the normal there.
 
     They start where they leave the box around the body: g is convex along them, and Newton's steps from outside stay
-    outside, or come near to the surface from inside where a body tapers.  A step is one loop over all lines that has no branch and few arrays, so that it becomes vector code.
+    outside, or come near to the surface from inside where a body tapers.  A step is one loop over all lines that has no
+    branch and few arrays, so that it becomes vector code.
     """
     a1, a2, a3, e1, e2, k1, k2 = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
     half = a1 * (1.0 + abs(k1)), a2 * (1.0 + abs(k2)), a3

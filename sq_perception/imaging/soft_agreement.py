@@ -39,8 +39,8 @@ def agreement(
 ) -> float:
     """Intersection over union of what the view and the body show, at every ``stride``-th row and column.
 
-    ``image`` (n, n) is that of a canonical view; the body is ``parameters`` a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y and ``rotation``
-    (3, 3), object to canonical frame.
+    ``image`` (n, n) is that of a canonical view; the body is ``parameters`` a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y and
+    ``rotation`` (3, 3), object to canonical frame.
     """
     n = image.shape[0]
     a1, a2, a3, e1, e2, t1, t2, t3, k1, k2 = parameters

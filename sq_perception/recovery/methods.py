@@ -10,6 +10,7 @@ import numpy as np
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
+from sq_perception.fitting.problem import PlaneError
 from sq_perception.fitting.rays import SAMPLE
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
@@ -22,6 +23,7 @@ _SCORE_STRIDE = 3
 _LEAST_MEASURED = 0.02
 """Share of a mask: a sensor that sees nothing of a thing smears its outline.  Of 3582 things of
 benchmarks/household_things 63 showed less; 16 had a body all the same, of 20 % IoU at most."""
+_PLANE_ABOVE = "the plane found lies above it and was left aside"
 _LEAST_BUDGET = 1e-6
 """Seconds; an object whose turn comes too late is still fitted, from one start."""
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
@@ -48,7 +50,11 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
     if not options.free_space:
         depth = np.where(obj.mask, depth, np.float32(np.nan))
         known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR)
-    return _surface_fit(obj, depth, camera, known)
+    try:
+        return _surface_fit(obj, depth, camera, known)
+    except PlaneError:  # it is what the object hangs below, or no support at all
+        found = _surface_fit(obj, depth, camera, replace(known, plane=None))
+        return replace(found, message=f"{found.message}; {_PLANE_ABOVE}")
 
 
 def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:

@@ -32,11 +32,12 @@ PLAIN = Terms(huber=np.inf, outline_huber=np.inf)
 SIGMA = 0.003
 
 
-def random_body(rng: np.random.Generator, shape: tuple[float, float] | None = None) -> Superquadric:
+def random_body(
+    rng: np.random.Generator, shape: tuple[float, float] | None = None, taper: tuple[float, float] = (0.0, 0.0)
+) -> Superquadric:
     exponents = rng.uniform(0.1, 1.0, 2) if shape is None else np.array(shape)
-    return Superquadric(
-        rng.uniform(0.03, 0.1, 3), exponents, rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.6], quaternions.random(1, rng)[0]
-    )
+    size, centre = rng.uniform(0.03, 0.1, 3), rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.6]
+    return Superquadric(size, exponents, centre, quaternions.random(1, rng)[0], np.asarray(taper))
 
 
 def rays_to(points: np.ndarray, pinhole: bool) -> np.ndarray:
@@ -57,7 +58,7 @@ def torch_rays(rays: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tens
 
 
 def as_torch(body: Superquadric) -> Superquadric:
-    return Superquadric.from_flat(torch.tensor(np.asarray(body.to_flat(), dtype=float)))
+    return Superquadric.from_flat(torch.tensor(np.asarray(body.to_numbers(), dtype=float)))
 
 
 def expected_sums(body: Superquadric, residuals: Callable[[Superquadric], torch.Tensor]) -> tuple[float, np.ndarray]:
@@ -91,15 +92,17 @@ def assert_same(
     assert (np.abs(sums[STEP_LENGTH, :STEP_LENGTH] - matrix[STEP_LENGTH]) / root).max() < 10 * tolerance
 
 
+TAPERS = [(0.0, 0.0), (0.4, -0.3)]
 SHAPES = [None, (0.1, 0.1), (0.02, 0.05), (1.0, 1.0), (0.1, 1.0), (1.0, 0.1), (1.8, 1.5)]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
+@pytest.mark.parametrize("taper", TAPERS)
 def test_point_residuals_and_derivatives(
-    stage: int, shape: tuple[float, float] | None, rng: np.random.Generator
+    taper: tuple[float, float], stage: int, shape: tuple[float, float] | None, rng: np.random.Generator
 ) -> None:
-    body = random_body(rng, shape)
+    body = random_body(rng, shape, taper)
     points = body.sample_surface(60, rng) + rng.normal(0, 0.004, (60, 3))
     function = statement.classic if stage == CLASSIC else statement.sampson
     expected = expected_sums(body, lambda moved: function(moved, torch.tensor(points)) / SIGMA)
@@ -124,11 +127,11 @@ def visible_points(body: Superquadric, rng: np.random.Generator, pinhole: bool) 
 
 
 @pytest.mark.parametrize("shape", SHAPES[:5])
-@pytest.mark.parametrize("pinhole", [True, False])
+@pytest.mark.parametrize(("pinhole", "taper"), zip([True, False], TAPERS, strict=True))
 def test_rendered_depth_and_derivatives(
-    pinhole: bool, shape: tuple[float, float] | None, rng: np.random.Generator
+    pinhole: bool, taper: tuple[float, float], shape: tuple[float, float] | None, rng: np.random.Generator
 ) -> None:
-    body = random_body(rng, shape)
+    body = random_body(rng, shape, taper)
     rays = rays_to(visible_points(body, rng, pinhole), pinhole)
     rays[:, DEPTH] += rng.normal(0, 0.003, len(rays))
     rays[:, LAST] = rays[:, DEPTH]
@@ -140,9 +143,9 @@ def test_rendered_depth_and_derivatives(
     assert_same(RENDERED, rays, NO_RAYS, PLAIN, body, expected, tolerance=1e-3 if shape != (0.02, 0.05) else 0.02)
 
 
-@pytest.mark.parametrize("pinhole", [True, False])
-def test_free_space_and_derivatives(pinhole: bool, rng: np.random.Generator) -> None:
-    body = random_body(rng)
+@pytest.mark.parametrize(("pinhole", "taper"), zip([True, False], TAPERS, strict=True))
+def test_free_space_and_derivatives(pinhole: bool, taper: tuple[float, float], rng: np.random.Generator) -> None:
+    body = random_body(rng, taper=taper)
     around = body.translation + rng.uniform(-0.12, 0.12, (400, 3))
     free = rays_to(around, pinhole)
     free[:, DEPTH] = np.where(rng.random(400) < 0.5, 1e300, around[:, 2])
@@ -240,10 +243,10 @@ def test_cost_never_rises_and_reaches_the_truth(rng: np.random.Generator) -> Non
     truth = random_body(rng)
     points = truth.sample_surface(300, rng)
     rays = rays_to(points, pinhole=False)
-    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3])
-    step = rng.normal(0, 0.15, STEP_LENGTH) * np.r_[np.ones(5), [0.1] * 3, np.ones(3)]
+    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
+    step = rng.normal(0, 0.15, STEP_LENGTH) * np.r_[np.ones(5), [0.1] * 3, np.ones(3), [0.0] * 2]
     moved = statement.moved(as_torch(truth), torch.tensor(step))
-    flat = np.asarray(moved.to_flat().numpy())
+    flat = np.asarray(moved.to_numbers().numpy())
     flat[3:5] = np.clip(flat[3:5], 0.1, 1.0)
     state = State.of(Superquadric.from_flat(flat))
     costs = []
@@ -258,7 +261,7 @@ def test_cost_never_rises_and_reaches_the_truth(rng: np.random.Generator) -> Non
 def test_bounds_hold(rng: np.random.Generator) -> None:
     truth = random_body(rng, (0.4, 0.5))
     rays = rays_to(truth.sample_surface(300, rng), pinhole=False)
-    limits = (np.r_[[0.06] * 3, [0.6] * 2, [-1.0] * 3], np.r_[[0.07] * 3, [1.0] * 2, [1.0] * 3])
+    limits = (np.r_[[0.06] * 3, [0.6] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.07] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
     state = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 30, 1e-6)
     assert (state.parameters >= limits[0]).all()
     assert (state.parameters <= limits[1]).all()
@@ -269,7 +272,7 @@ def test_a_body_at_the_end_of_its_valley_takes_no_step(rng: np.random.Generator)
     """What a step promises tells that it is not worth a look: the body stays as it is, to the bit."""
     truth = random_body(rng, (0.4, 0.8))
     rays = rays_to(truth.sample_surface(300, rng) + rng.normal(0, SIGMA, (300, 3)), pinhole=False)
-    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3])
+    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
     there = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 100, 1e-12)
     again = minimize(SAMPSON, rays, NO_RAYS, PLAIN, there, limits, 100, 1e-6)
     assert again.iterations == there.iterations + 1

@@ -17,7 +17,7 @@ PATIENCE = 600
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"'
 CODE = """
 from sq_perception.geometry import kernels
-value = kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0)
+value = kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0, 0.0, 0.0)
 print(kernels.__file__, round(value, 9), len(kernels.gauge.stats.cache_hits))
 """
 

@@ -140,7 +140,7 @@ class TestClosedForms:
         np.testing.assert_allclose(found, corners, rtol=1e-3)
         tensors = Superquadric.from_flat(torch.from_numpy(octahedron.to_flat().copy()))
         np.testing.assert_allclose(tensors.support(torch.from_numpy(directions)).numpy(), found, rtol=1e-12)
-        in_kernels = [kernels.support(*direction, 0.2, 0.3, 0.5, 2.0, 2.0) for direction in directions]
+        in_kernels = [kernels.support(*direction, 0.2, 0.3, 0.5, 2.0, 2.0, 0.0, 0.0) for direction in directions]
         np.testing.assert_allclose(in_kernels, found, rtol=1e-6)
 
     def test_bounding_box_holds_the_samples(self) -> None:
@@ -218,10 +218,10 @@ class TestKernels:
                 point = torch.tensor(p[None], requires_grad=True)
                 g = Superquadric.from_flat(flat).gauge(point)[0]
                 g.backward()
-                compiled = kernels.gauge_derivatives(*p, *body.size, *body.shape)
+                compiled = kernels.gauge_derivatives(*p, *body.size, *body.shape, 0.0, 0.0)[:6]
                 by_size = -p * np.array(compiled[1:4]) / body.size
                 assert compiled[0] == pytest.approx(g.item(), rel=1e-9)
-                assert kernels.gauge(*p, *body.size, *body.shape) == pytest.approx(g.item(), rel=1e-9)
+                assert kernels.gauge(*p, *body.size, *body.shape, 0.0, 0.0) == pytest.approx(g.item(), rel=1e-9)
                 nonzero = p != 0
                 np.testing.assert_allclose(np.array(compiled[1:4])[nonzero], point.grad[0].numpy()[nonzero], rtol=1e-7)
                 np.testing.assert_allclose(compiled[4:], flat.grad[3:5].numpy(), rtol=1e-6, atol=1e-9)
@@ -233,7 +233,7 @@ class TestKernels:
         for body in random_bodies(200, 29, 0.05, 2.0):
             origin, direction = rng.standard_normal(3), rng.standard_normal(3)
             direction -= 0.8 * (origin + direction)
-            hit, first, last = kernels.ray_interval(tuple(origin), tuple(direction), (*body.size, *body.shape))
+            hit, first, last = kernels.ray_interval(tuple(origin), tuple(direction), (*body.size, *body.shape, 0.0, 0.0))
             t = np.linspace(-5, 10, 4001)
             moved = Superquadric(body.size, body.shape, np.zeros(3), IDENTITY)
             g = moved.gauge(origin + t[:, None] * direction)

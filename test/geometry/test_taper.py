@@ -102,8 +102,8 @@ def test_rays_meet_the_body_where_they_meet_a_dense_mesh() -> None:
             before = camera.points(np.where(hit, share * depth, share * 0.6))
             assert (body.gauge(before.reshape(-1, 3)) >= 1 - 1e-9).all()
         surface = mesh(body, 96)
-        distance, _ = cKDTree(surface.triangles_center).query(points[::10])
-        assert np.quantile(distance, 0.9) < 0.1 * body.size.max()
+        distance, _ = cKDTree(surface.sample(100000, seed=0)).query(points[::10])
+        assert distance.max() < 0.03 * body.size.max()
 
 
 def test_all_forms_are_the_same_body() -> None:
@@ -112,10 +112,11 @@ def test_all_forms_are_the_same_body() -> None:
     points = body.sample_surface(200, rng)
     for form in [*body.equivalent_forms(), body.canonical_form(), Superquadric.stack([body]).canonical_form()[0]]:
         np.testing.assert_allclose(form.gauge(points), 1.0, atol=1e-9)
-    assert body.canonical_form().to_numbers() == pytest.approx(Superquadric.stack([body]).canonical_form().to_numbers()[0])
+    of_batch = Superquadric.stack([body]).canonical_form().to_numbers()[0]
+    np.testing.assert_allclose(body.canonical_form().to_numbers(), of_batch)
 
 
-def test_the_untapered_body_encloses_it_in_the_same_box() -> None:
+def test_the_untapered_body_encloses_it() -> None:
     rng = np.random.default_rng(7)
     body = tapered(rng)
     around = body.untapered()

@@ -16,13 +16,14 @@ _BISECTIONS = 80
 
 
 def moved(body: Superquadric, step: torch.Tensor) -> Superquadric:
-    """The body after a step (11,): d log a, d e, d t and a rotation vector in the object frame."""
+    """The body after a step (13,): d log a, d e, d t, a rotation vector in the object frame and d k."""
     turn = quaternions.from_rotation_vector(step[8:11])
     return Superquadric(
         body.size * torch.exp(step[0:3]),
         body.shape + step[3:5],
         body.translation + step[5:8],
         quaternions.multiply(body.rotation, turn),
+        body.taper + step[11:13],
     )
 
 
@@ -65,7 +66,7 @@ def outline(
 
 def lowest_height(body: Superquadric, plane: torch.Tensor) -> torch.Tensor:
     """Height () of the body's lowest point above the plane n.x + d, metres."""
-    return plane[:3] @ body.translation + plane[3] - body.support(plane[None, :3])[0]
+    return plane[:3] @ body.translation + plane[3] - body.support(-plane[None, :3])[0]
 
 
 def leaning(body: Superquadric, plane: torch.Tensor) -> torch.Tensor:

@@ -21,7 +21,7 @@ from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.recovery import own_segments, seen_object
+from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
@@ -117,6 +117,18 @@ def test_a_thing_on_the_lower_of_two_levels_reaches_below_the_higher_one(symmetr
     by_label = {body.label: body.superquadric for body in found.bodies}
     assert iou(by_label[1], other) > 0.9
     assert iou(by_label[2], truth) > 0.9
+
+
+def test_a_plane_above_a_thing_loses_no_body(symmetry, monkeypatch):
+    """As a cupboard's board above a pan: the fit refuses such a support, the user gets the body all the same."""
+    truth = random_bodies(1, 3, scale=0.1)[0]
+    depth, labels = seen([truth], CAMERA, background=1.6)
+    above = np.array([0.0, -1.0, 0.0, truth.translation[1] - 0.3])
+    monkeypatch.setattr(supports, "support", lambda *_: above)
+    (found,) = symmetry.recover(depth, CAMERA, labels).bodies
+    assert found.status != Status.FAILED
+    assert iou(found.superquadric, truth) > 0.85
+    assert "plane found lies above it" in found.message
 
 
 def test_a_frame_with_masks_keeps_their_values_and_order(symmetry):

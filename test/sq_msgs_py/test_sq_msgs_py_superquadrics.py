@@ -116,6 +116,7 @@ def test_a_cloud_of_release_0_2_0_is_read(rng: np.random.Generator) -> None:
         np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
     for column in COUNTS:
         np.testing.assert_array_equal(getattr(after, column), np.zeros(3, np.uint32))
+    np.testing.assert_array_equal(after.taper, np.zeros((3, 2)))
     for column in DEVIATIONS:
         assert getattr(after, column).shape == getattr(before, column).shape
         assert np.isnan(getattr(after, column)).all()
