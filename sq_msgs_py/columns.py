@@ -28,9 +28,10 @@ class MessageError(ValueError):
     """A message that does not hold what it should; its text names what was expected and what arrived."""
 
 
-def column(*names: str, is_finite: bool = False) -> Mapping[str, Any]:
-    """Metadata of a dataclass field: which fields of the message it holds, and whether it has no NaN."""
-    return {"names": names, "is_finite": is_finite}
+def column(*names: str, is_finite: bool = False, missing: float = np.nan) -> Mapping[str, Any]:
+    """Metadata of a dataclass field: which fields of the message it holds, whether it has no NaN, and what stands for
+    numbers that are not given."""
+    return {"names": names, "is_finite": is_finite, "missing": missing}
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class Columns:
             is_unsigned = kinds[names[0]] == UINT32
             shape = (count,) if len(names) == 1 else (count, len(names))
             if given is None:
-                given = np.zeros(shape, np.uint32) if is_unsigned else np.full(shape, np.nan)
+                given = np.zeros(shape, np.uint32) if is_unsigned else np.full(shape, each.metadata["missing"])
             values = np.asarray(given)
             if values.size == 0 and count == 0:
                 values = values.reshape(shape)

@@ -29,6 +29,8 @@ from sq_msgs_py.markers import checked_mesh
 from sq_msgs_py.superquadrics import SuperquadricArray
 
 BOX, CYLINDER, SPHERE = "box", "cylinder", "sphere"
+_SECTIONS = 257
+"""Sections of a tapered body whose support is looked at: the largest one is missed by less than 1e-4 of it."""
 _LEAST_AREA = 1e-12
 """Of a triangle that counts, for a body of half sizes 1: smaller ones have no normal."""
 
@@ -105,7 +107,13 @@ def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     )
 
 
-def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, shape: np.ndarray) -> float:
+def enclosing_factor(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    size: np.ndarray,
+    shape: np.ndarray,
+    taper: np.ndarray | tuple[float, float] = (0.0, 0.0),
+) -> float:
     """By how much a mesh of points on a body must grow about the centre to enclose it, at least 1.
 
     The plane of a face, n.p = d, has the body behind it when d reaches the support function h(n), the dual of the
@@ -116,8 +124,8 @@ def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, 
     ----------
     vertices, faces
         (k, 3) in the body's own frame and (m, 3), outwards, around the origin.
-    size, shape
-        (3,) and (2,) of the body.
+    size, shape, taper
+        (3,), (2,) and (2,) of the body, as in a message.
 
     Raises
     ------
@@ -138,7 +146,20 @@ def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, 
         raise ValueError("mesh: expected the origin inside and the faces outwards")
     x, y, z = np.abs(normals).T
     support = _dual(_dual(x, y, e2), z, e1)
+    if np.any(taper):
+        support = _of_sections(normals, (e1, e2), np.asarray(taper, dtype=float))
     return max(float((support / distance).max()), 1.0)
+
+
+def _of_sections(normals: np.ndarray, shape: tuple[float, float], taper: np.ndarray) -> np.ndarray:
+    """Support (n,) of a tapered body of half sizes 1: the largest one of its sections along its z axis."""
+    e1, e2 = shape
+    angle = np.linspace(-0.5 * pi, 0.5 * pi, _SECTIONS)
+    high = np.sign(angle) * np.abs(np.sin(angle)) ** e1
+    scale = (1 + taper * high[:, None]) / (1 + np.abs(taper))
+    x, y, z = normals.T
+    across = _dual(np.abs(x)[:, None] * scale[:, 0], np.abs(y)[:, None] * scale[:, 1], e2)
+    return np.asarray((across * np.cos(angle) ** e1 + z[:, None] * high).max(axis=1))
 
 
 def _largest(c: float, d: float, e: float) -> float:

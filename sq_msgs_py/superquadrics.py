@@ -4,11 +4,17 @@ Equation, in the body's own frame (F < 1 inside, F = 1 on the surface):
 
     F(x, y, z) = (|x/a1|^(2/e2) + |y/a2|^(2/e2))^(e2/e1) + |z/a3|^(2/e1)
 
+A body may taper: in place of x and y stand x' = x / s(k_x) and y' = y / s(k_y), the section at z being scaled by
+
+    s(k) = (1 + k z/a3) / (1 + |k|),   for |z| <= a3
+
+so that a1 and a2 are the half sizes of its largest section.  Whoever leaves k aside gets a body that encloses it.
+
 Fields, version 1
 -----------------
 x y z           centre, metres, in the frame of the header
 qx qy qz qw     unit quaternion, body to header frame
-a1 a2 a3        HALF sizes along the body's x y z, metres
+a1 a2 a3        HALF sizes along the body's x y z, metres; of its largest section where it tapers
 e1 e2           exponents: e1 along z, e2 in the xy plane; 0.1 is a box, 1 an ellipsoid, 2 an octahedron
 score           0 to 1: agreement of the soft-rendered body with the image
 residual        root mean square distance of the seen points to the surface, metres
@@ -22,11 +28,12 @@ reason          why the status is 1, and what else there is to know of the fit: 
 sigma_e1 sigma_e2    standard deviations of the exponents
 sigma_c1..c3    standard deviations of the centre along the body's axes x y z, metres
 sigma_r1..r3    standard deviations of the rotation about the body's axes x y z, radians
+kx ky           tapers, -0.95 to 0.95; 0 for none
 
 All are float32 but id, status, label, seen, fused and reason, which are uint32.  Deviations are NaN where unknown.  The
 header copies stamp and frame of the depth image.  Readers find fields by name: a later version may append fields, and
 raises VERSION when it changes the meaning of one.  What follows status was appended after 0.2.0; in a cloud without it
-integers are 0 and deviations NaN.
+integers and tapers are 0 and deviations NaN.
 
 The eight parameter vectors of one body (half turns about the axes, quarter turns about z with a1 and a2 exchanged) are
 equally right: compare bodies, never raw parameters.
@@ -72,6 +79,7 @@ FIELDS: tuple[tuple[str, int], ...] = tuple(
     )
 ) + tuple((name, UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
 FIELDS += tuple((f"sigma_{name}", FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
+FIELDS += (("kx", FLOAT32), ("ky", FLOAT32))
 """Name and PointField datatype of every field, in the order of the message."""
 
 _NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index("label")])
@@ -96,6 +104,8 @@ class SuperquadricArray(Columns):
     sigma_shape : (n, 2) float32
     sigma_centre, sigma_turn : (n, 3) float32
         NaN if not given.
+    taper : (n, 2) float32
+        0 if not given.
 
     Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
     """
@@ -118,6 +128,7 @@ class SuperquadricArray(Columns):
     sigma_shape: np.ndarray | None = field(default=None, metadata=column("sigma_e1", "sigma_e2"))
     sigma_centre: np.ndarray | None = field(default=None, metadata=column("sigma_c1", "sigma_c2", "sigma_c3"))
     sigma_turn: np.ndarray | None = field(default=None, metadata=column("sigma_r1", "sigma_r2", "sigma_r3"))
+    taper: np.ndarray | None = field(default=None, metadata=column("kx", "ky", missing=0.0))
 
     @property
     def recovered(self) -> SuperquadricArray:

@@ -49,7 +49,7 @@ class Columns:
 
     def iou(self, body: Superquadric) -> float:
         """Volume IoU with a single superquadric, 0 to 1."""
-        flat, matrix = np.array(body.to_flat(), dtype=float), np.ascontiguousarray(body.rotation_matrix, dtype=float)
+        flat, matrix = np.array(body.to_numbers(), dtype=float), np.ascontiguousarray(body.rotation_matrix, dtype=float)
         common = _common(flat, matrix, self.corner, self.step, self.low, self.high) * float(np.prod(self.step))
         return common / (self.volume + float(body.volume()) - common)
 
@@ -79,7 +79,7 @@ def _common(
     body: np.ndarray, m: np.ndarray, corner: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> float:
     """Summed length of what the columns share with the body."""
-    form = body[0], body[1], body[2], body[3], body[4]
+    form = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
     total = 0.0
     for i in range(low.shape[0]):
         for j in range(low.shape[1]):

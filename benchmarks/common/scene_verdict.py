@@ -190,7 +190,7 @@ def _answer(
     hull = placed.hull
     turn, place = placed.rotation, placed.translation
     iou = placed.thing.columns.iou(body.transformed(quaternions.from_matrix(turn.T), -turn.T @ place))
-    excess = 2 * body.support(scene.table.T) - np.ptp(hull @ scene.table, axis=0)
+    excess = body.support(scene.table.T) + body.support(-scene.table.T) - np.ptp(hull @ scene.table, axis=0)
     covered = np.full(3, np.nan)
     if sigma is not None and np.isfinite(sigma).all():
         extent = np.ptp(hull @ body.rotation_matrix, axis=0) / 2

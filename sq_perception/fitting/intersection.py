@@ -82,7 +82,7 @@ def gauge_along(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
     for i in range(filled):
         ex, ey, ez, shift = lanes[EX, i], lanes[EY, i], lanes[EZ, i], lanes[SHIFT, i]
         x, y, z = lanes[QX, i] + shift * ex, lanes[QY, i] + shift * ey, lanes[QZ, i] + shift * ez
-        g, gx, gy, gz, g1, g2 = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2)
+        g, gx, gy, gz, g1, g2, _, _ = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, 0.0, 0.0)
         lanes[G, i], lanes[GX, i], lanes[GY, i], lanes[GZ, i] = g, gx, gy, gz
         lanes[G1, i], lanes[G2, i] = g1, g2
         lanes[SLOPE, i] = gx * ex + gy * ey + gz * ez

@@ -5,7 +5,9 @@ early exits, which array code cannot express.  These scalar kernels are the only
 prove them equal to the first.  All arguments are in the object's own frame.
 
 A ray p = o + t d meets a convex g: Newton's method for g = 1, started where the ray enters the bounding box, approaches
-from outside without overshooting; a slope that is not negative before g = 1 means that the ray misses.
+from outside without overshooting; a slope that is not negative before g = 1 means that the ray misses.  Along a ray the
+gauge of a tapered body is not convex: its first intersection is bracketed by even steps, then found by Newton's method
+that never leaves the bracket.  What is thinner than a step is found where the gauge has its minimum within one.
 """
 
 from __future__ import annotations
@@ -30,8 +32,11 @@ from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_fro
 _F = TypeVar("_F", bound=Callable[..., Any])
 Triple: TypeAlias = tuple[float, float, float]
 """A point, a direction or half sizes."""
-Form: TypeAlias = tuple[float, float, float, float, float]
-"""a1 a2 a3 e1 e2."""
+Form: TypeAlias = tuple[float, float, float, float, float, float, float]
+"""a1 a2 a3 e1 e2 k_x k_y."""
+
+Support: TypeAlias = tuple[float, float, float, float, float, float, float, float]
+"""A support function and its derivatives by n_x n_y n_z e1 e2 k_x k_y."""
 
 _PROCESS, _one_at_a_time = os.getpid(), threading.Lock()
 """The process that may run parallel kernels, and the lock that makes their calls wait for each other."""
@@ -108,6 +113,14 @@ def _imported(file: Path) -> set[Path]:
 
 RAY_TOLERANCE, MAX_NEWTON_STEPS = 1e-9, 60
 """Tolerance of a ray's entry, as a share of its way through the bounding box, and of the gauge there; most steps."""
+_SINES = tuple(math.sin(math.pi * k / 6) for k in range(-3, 4))
+"""Points of a tapered body's profile from which its support is sought, from pole to pole."""
+_SUPPORT_STEPS = 12
+"""Most steps of that search; mostly 4 do."""
+_SUPPORT_TOLERANCE = 1e-7
+"""Error of the sine at which it ends: the support is off by its square."""
+_STRIDES = 12
+"""Even steps through a tapered body's frustum in which a ray's first intersection is bracketed."""
 _NEGLIGIBLE_LOG2 = -115.0
 """A power below 2^this adds nothing to 1."""
 _TINIEST, _TINY = 1e-290, 1e-145
@@ -138,38 +151,48 @@ def p_norm(u: float, v: float, e: float) -> tuple[float, float, float, float]:
 
 
 @inline_kernel
-def gauge(x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
+def section(z: float, a3: float, k: float) -> float:
+    """1 + k z/a3, the scale of a tapered body's section at z; beyond the narrow end that of the end."""
+    return max(1.0 + k * (z / a3), 1.0 - abs(k))
+
+
+@inline_kernel
+def gauge(
+    x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float, k2: float
+) -> float:
     """The gauge g at a point."""
-    h, _, _, _ = p_norm(abs(x) / a1, abs(y) / a2, e2)
+    h, _, _, _ = p_norm(abs(x / section(z, a3, k1)) / a1, abs(y / section(z, a3, k2)) / a2, e2)
     g, _, _, _ = p_norm(h, abs(z) / a3, e1)
     return g
 
 
 @inline_kernel
 def gauge_derivatives(
-    x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float
-) -> tuple[float, float, float, float, float, float]:
-    """g at a point and its derivatives: g, g_x, g_y, g_z, g_e1, g_e2.
+    x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float, k2: float
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """g at a point and its derivatives: g, g_x, g_y, g_z, g_e1, g_e2, g_k1, g_k2.
 
-    The derivative by a half size follows from these: dg/da1 = -x g_x / a1.
+    The derivative by a half size follows from these: dg/da1 = -x g_x / a1, dg/da3 = -z g_z / a3.
     """
-    h, h_x, h_y, h_e = p_norm(abs(x) / a1, abs(y) / a2, e2)
+    f1, f2 = section(z, a3, k1), section(z, a3, k2)
+    h, h_x, h_y, h_e = p_norm(abs(x / f1) / a1, abs(y / f2) / a2, e2)
     g, g_h, g_w, g_e = p_norm(h, abs(z) / a3, e1)
-    return (
-        g,
-        math.copysign(g_h * h_x / a1, x),
-        math.copysign(g_h * h_y / a2, y),
-        math.copysign(g_w / a3, z),
-        g_e,
-        g_h * h_e,
-    )
+    g_x, g_y = math.copysign(g_h * h_x / a1, x) / f1, math.copysign(g_h * h_y / a2, y) / f2
+    x_x, y_y = x * g_x / f1, y * g_y / f2
+    is_inside1, is_inside2 = 1.0 + k1 * (z / a3) > 1.0 - abs(k1), 1.0 + k2 * (z / a3) > 1.0 - abs(k2)
+    g_z = math.copysign(g_w / a3, z) - (x_x * k1 if is_inside1 else 0.0) / a3 - (y_y * k2 if is_inside2 else 0.0) / a3
+    g_k1 = -x_x * (z / a3 if is_inside1 else -math.copysign(1.0, k1))
+    g_k2 = -y_y * (z / a3 if is_inside2 else -math.copysign(1.0, k2))
+    return g, g_x, g_y, g_z, g_e, g_h * h_e, g_k1, g_k2
 
 
 @inline_kernel
-def gauge_slope(
-    x: float, y: float, z: float, dx: float, dy: float, dz: float, a1: float, a2: float, a3: float, e1: float, e2: float
-) -> tuple[float, float]:
+def gauge_slope(x: float, y: float, z: float, dx: float, dy: float, dz: float, form: Form) -> tuple[float, float]:
     """g at a point and its derivative along (dx, dy, dz)."""
+    a1, a2, a3, e1, e2, k1, k2 = form
+    if k1 != 0.0 or k2 != 0.0:
+        g, g_x, g_y, g_z, _, _, _, _ = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, k1, k2)
+        return g, g_x * dx + g_y * dy + g_z * dz
     h, h_x, h_y, _ = p_norm(abs(x) / a1, abs(y) / a2, e2)
     g, g_h, g_w, _ = p_norm(h, abs(z) / a3, e1)
     slope = g_h * (math.copysign(h_x / a1, x) * dx + math.copysign(h_y / a2, y) * dy) + math.copysign(g_w / a3, z) * dz
@@ -182,9 +205,123 @@ def conjugate(e: float) -> float:
     return max(2.0 - e, LEAST_CONJUGATE)
 
 
+@inline_kernel
+def _by_sine(s: float, nx: float, ny: float, nz: float, form: Form) -> tuple[float, float, float]:
+    """A tapered body's support by the point of its profile whose normal has the sine ``s``.
+
+    The section at z = t a3 has the support sigma(t) S(t), where (t, sigma) runs on the profile, a unit ball, and S is
+    the dual norm of (a1 f1 n_x, a2 f2 n_y).  Returned are n_z a3 t + sigma S, and A and S: at the maximum the normal of
+    the profile is along (A, S), A = n_z a3 + sigma S'.
+    """
+    a1, a2, a3, e1, e2, k1, k2 = form
+    _, sigma, t, _ = p_norm(math.sqrt(max(1.0 - s * s, 0.0)), abs(s), conjugate(e1))
+    t = math.copysign(t, s)
+    u, v = a1 * abs(nx), a2 * abs(ny)
+    across, by_u, by_v, _ = p_norm(u * (1.0 + k1 * t), v * (1.0 + k2 * t), conjugate(e2))
+    along = nz * a3 + sigma * (by_u * u * k1 + by_v * v * k2)
+    return nz * a3 * t + sigma * across, along, across
+
+
 @kernel
-def support(nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
-    """max n.p over the body, for a direction of any length: the dual norm, see :meth:`Superquadric.support`."""
+def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
+    """The sines (n,) of :func:`_by_sine` at the maximum for directions (3, n) in the frame of a tapered body.
+
+    The best of a few, then secants that never leave a bracket; loops over directions without a branch, for vector code.
+    """
+    count = directions.shape[1]
+    s, low, high, best = np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, -np.inf)
+    before, excess_before = np.zeros(count), np.zeros(count)
+    nx, ny, nz = directions[0], directions[1], directions[2]
+    for k in range(len(_SINES)):
+        at, left, right = _SINES[k], _SINES[max(k - 1, 0)], _SINES[min(k + 1, len(_SINES) - 1)]
+        for i in range(count):
+            value, _, _ = _by_sine(at, nx[i], ny[i], nz[i], form)
+            above = value > best[i]
+            best[i] = value if above else best[i]
+            s[i] = at if above else s[i]
+            low[i], high[i] = left if above else low[i], right if above else high[i]
+    for step in range(_SUPPORT_STEPS):
+        farthest = 0.0
+        for i in range(count):
+            at = s[i]
+            _, along, across = _by_sine(at, nx[i], ny[i], nz[i], form)
+            sine = along / max(math.sqrt(along * along + across * across), _TINY)
+            excess = at - sine
+            left, right = low[i] if excess > 0.0 else at, at if excess > 0.0 else high[i]
+            change = excess - excess_before[i]
+            ahead = at - excess * (at - before[i]) / (change if change != 0.0 else 1.0)
+            ahead = sine if step == 0 else ahead
+            s[i] = ahead if (left < ahead) & (ahead < right) else 0.5 * (left + right)
+            low[i], high[i], before[i], excess_before[i] = left, right, at, excess
+        for i in range(count):
+            farthest = max(farthest, abs(excess_before[i]))
+        if farthest < _SUPPORT_TOLERANCE:
+            break
+    return s
+
+
+@kernel
+def support_derivatives(
+    nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float, k2: float
+) -> Support:
+    """max n.p over the body, for a direction of any length, and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2, h_k1,
+    h_k2.
+
+    The dual norm, see :meth:`Superquadric.support`.  The derivatives by n are the point of the body that is farthest;
+    that by a half size is dh/da1 = n_x h_nx / a1.
+    """
+    if k1 != 0.0 or k2 != 0.0:
+        sines = profile_sines(np.array([[nx], [ny], [nz]]), (a1, a2, a3, e1, e2, k1, k2))
+        return support_at(sines[0], nx, ny, nz, a1, a2, a3, e1, e2, k1, k2)
+    return support_at(0.0, nx, ny, nz, a1, a2, a3, e1, e2, 0.0, 0.0)
+
+
+@inline_kernel
+def support_at(
+    s: float,
+    nx: float,
+    ny: float,
+    nz: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    e1: float,
+    e2: float,
+    k1: float,
+    k2: float,
+) -> Support:
+    """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; any sine will do without a taper."""
+    u, v = a1 * abs(nx), a2 * abs(ny)
+    is_tapered = k1 != 0.0 or k2 != 0.0
+    t = 0.0
+    if is_tapered:
+        _, _, t, _ = p_norm(math.sqrt(max(1.0 - s * s, 0.0)), abs(s), conjugate(e1))
+        t = math.copysign(t, s)
+    along = _by_sine(s, nx, ny, nz, (a1, a2, a3, e1, e2, k1, k2))[1] if is_tapered else nz * a3
+    f1, f2 = 1.0 + k1 * t, 1.0 + k2 * t
+    inner, inner_u, inner_v, inner_e = p_norm(f1 * u, f2 * v, conjugate(e2))
+    h, h_inner, h_z, h_e = p_norm(inner, abs(along), conjugate(e1))
+    h += (nz * a3 - along) * t
+    by_u, by_v = h_inner * inner_u, h_inner * inner_v
+    return (
+        h,
+        math.copysign(by_u * f1 * a1, nx),
+        math.copysign(by_v * f2 * a2, ny),
+        math.copysign(h_z, along) * a3,
+        -h_e,
+        -h_inner * inner_e,
+        by_u * u * t,
+        by_v * v * t,
+    )
+
+
+@kernel
+def support(
+    nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float, k2: float
+) -> float:
+    """The first of :func:`support_derivatives`."""
+    if k1 != 0.0 or k2 != 0.0:
+        return support_derivatives(nx, ny, nz, a1, a2, a3, e1, e2, k1, k2)[0]
     h, _, _, _ = p_norm(a1 * abs(nx), a2 * abs(ny), conjugate(e2))
     h, _, _, _ = p_norm(h, a3 * abs(nz), conjugate(e1))
     return h
@@ -218,39 +355,121 @@ def box_interval(origin: Triple, way: Triple, half: Triple) -> tuple[float, floa
 
 
 @kernel
+def inside_box(origin: Triple, way: Triple, form: Form) -> tuple[float, float]:
+    """Where the ray runs inside the box around a body, of a tapered one the frustum: as :func:`box_interval`."""
+    a1, a2, a3, _, _, k1, k2 = form
+    if k1 == 0.0 and k2 == 0.0:
+        return box_interval(origin, way, (a1, a2, a3))
+    ox, oy, oz = origin
+    dx, dy, dz = way
+    t_in, t_out = box_interval(origin, way, (a1 * (1.0 + abs(k1)), a2 * (1.0 + abs(k2)), a3))
+    for sign in (-1.0, 1.0):
+        for o, d, slant, a in ((ox, dx, k1 * a1 / a3, a1), (oy, dy, k2 * a2 / a3, a2)):
+            # sign (o + t d) <= a + slant (oz + t dz)
+            rate, room = sign * d - slant * dz, a + slant * oz - sign * o
+            if abs(rate) < 1e-300:
+                if room < 0.0:
+                    return 1.0, -1.0
+            elif rate > 0.0:
+                t_out = min(t_out, room / rate)
+            else:
+                t_in = max(t_in, room / rate)
+    return t_in, t_out
+
+
+@kernel
 def ray_entry(origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
     """First intersection of the ray with the surface, over all t: (hit, t)."""
-    t_in, t_out = box_interval(origin, way, form[:3])
+    t_in, t_out = inside_box(origin, way, form)
     if t_in > t_out:
         return False, 0.0
-    return _newton(t_in, t_out, origin, way, form)
+    return _first(t_in, t_out, origin, way, form)
 
 
 @kernel
 def ray_interval(origin: Triple, way: Triple, form: Form) -> tuple[bool, float, float]:
-    """Both intersections of the ray with the surface: (hit, t_first, t_last)."""
-    t_in, t_out = box_interval(origin, way, form[:3])
+    """First and last intersection of the ray with the surface: (hit, t_first, t_last)."""
+    t_in, t_out = inside_box(origin, way, form)
     if t_in > t_out:
         return False, 0.0, 0.0
-    hit, first = _newton(t_in, t_out, origin, way, form)
+    hit, first = _first(t_in, t_out, origin, way, form)
     if not hit:
         return False, 0.0, 0.0
     dx, dy, dz = way
-    hit, last = _newton(-t_out, -t_in, origin, (-dx, -dy, -dz), form)
+    hit, last = _first(-t_out, -t_in, origin, (-dx, -dy, -dz), form)
     if not hit:
         return False, 0.0, 0.0
     return True, first, -last
 
 
 @kernel
+def _first(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
+    if form[5] == 0.0 and form[6] == 0.0:
+        return _newton(t_in, t_out, origin, way, form)
+    return _bracketed(t_in, t_out, origin, way, form)
+
+
+@kernel
+def _bracketed(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
+    """The first intersection of a ray with a tapered body, in even steps from where it enters the frustum."""
+    ox, oy, oz = origin
+    dx, dy, dz = way
+    g, slope = gauge_slope(ox + t_in * dx, oy + t_in * dy, oz + t_in * dz, dx, dy, dz, form)
+    if g <= 1.0 + RAY_TOLERANCE:
+        return True, t_in
+    stride, low = (t_out - t_in) / _STRIDES, t_in
+    for k in range(_STRIDES):
+        high = t_in + (k + 1) * stride
+        g_high, s_high = gauge_slope(ox + high * dx, oy + high * dy, oz + high * dz, dx, dy, dz, form)
+        right, inner = high, g_high
+        if g_high > 1.0 and slope < 0.0 < s_high:  # the smallest gauge of this step may be below 1
+            left, s_left, s_right = low, slope, s_high
+            for _ in range(MAX_NEWTON_STEPS):
+                ahead = left + (right - left) * min(max(s_left / (s_left - s_right), 0.1), 0.9)
+                inner, s = gauge_slope(ox + ahead * dx, oy + ahead * dy, oz + ahead * dz, dx, dy, dz, form)
+                if s < 0.0:
+                    left, s_left = ahead, s
+                else:
+                    right, s_right = ahead, s
+                if inner <= 1.0 or right - left <= RAY_TOLERANCE * stride:
+                    right = ahead
+                    break
+        if inner <= 1.0:
+            return True, _crossing(low, right, origin, way, form)
+        low, g, slope = high, g_high, s_high
+    return False, 0.0
+
+
+@kernel
+def _crossing(low: float, high: float, origin: Triple, way: Triple, form: Form) -> float:
+    """Where g = 1 between a point outside and one inside the body: Newton's method, kept in the bracket."""
+    ox, oy, oz = origin
+    dx, dy, dz = way
+    enough = RAY_TOLERANCE * (high - low)
+    t = low
+    for _ in range(MAX_NEWTON_STEPS):
+        g, slope = gauge_slope(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, form)
+        if g > 1.0:
+            low = t
+        else:
+            high = t
+        ahead = t + (1.0 - g) / slope if slope < 0.0 else low
+        if not low < ahead < high:
+            ahead = 0.5 * (low + high)
+        if abs(ahead - t) <= enough:
+            return ahead
+        t = ahead
+    return t
+
+
+@kernel
 def _newton(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
     ox, oy, oz = origin
     dx, dy, dz = way
-    a1, a2, a3, e1, e2 = form
     t = t_in
     enough = RAY_TOLERANCE * (t_out - t_in)
     for _ in range(MAX_NEWTON_STEPS):
-        g, slope = gauge_slope(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, a1, a2, a3, e1, e2)
+        g, slope = gauge_slope(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, form)
         if g <= 1.0 + RAY_TOLERANCE:
             return True, t
         if slope >= 0.0:

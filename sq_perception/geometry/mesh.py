@@ -3,7 +3,8 @@
 A superquadric with e1, e2 <= 2 is convex, so the convex hull of surface points is its mesh.  The points are those of
 the parametric form (thesis, equation 3.5) on a uniform grid of angles, which crowds them where the surface bends.  The
 hull is computed at unit size and then stretched by the half sizes: a map that keeps convexity and topology, and spares
-the hull algorithm the nearly flat input of a thin body.
+the hull algorithm the nearly flat input of a thin body.  A taper moves the vertices of the mesh, and may leave it not
+quite convex.
 
 Metres, in the frame that the body is given in.
 """
@@ -62,7 +63,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
     vertices : (n, 3)
         On the surface, in the body's parent frame.
     faces : (m, 3)
-        Indices of vertices; watertight and convex, faces outwards.
+        Indices of vertices; watertight, faces outwards; convex without a taper.
     """
     from scipy.spatial import ConvexHull  # here: a node that recovers does without
 
@@ -86,6 +87,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     inwards = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
+    vertices[:, :2] *= 1 + body.taper * vertices[:, 2:]
     return body.to_parent(vertices * body.size), faces
 
 

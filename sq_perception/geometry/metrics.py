@@ -2,7 +2,7 @@
 
 IoU counts grid points inside either and both bodies (equation 5.1).  Bodies are convex (e <= 2), so a grid column meets
 each in one interval, and points are counted per column from the interval's ends: exact for the grid, at the cost of a
-surface instead of a volume.
+surface instead of a volume.  Of one that tapers and is not convex all between its first and last point counts.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _batch(prediction: Superquadric, truth: Superquadric) -> int:
 def _iou(a: Superquadric, b: Superquadric, lower: np.ndarray, upper: np.ndarray, resolution: int) -> np.ndarray:
     if resolution < 2:
         raise ValueError(f"expected a resolution of at least 2 points an axis, got {resolution}")
-    flats = [np.ascontiguousarray(body.to_flat().reshape(-1, 12), dtype=float) for body in (a, b)]
+    flats = [np.ascontiguousarray(body.to_numbers().reshape(-1, 14), dtype=float) for body in (a, b)]
     matrices = [np.ascontiguousarray(body.rotation_matrix.reshape(-1, 3, 3), dtype=float) for body in (a, b)]
     out = np.empty(len(flats[0]))
     _iou_batch(flats[0], matrices[0], flats[1], matrices[1], lower, upper, resolution, out)
@@ -70,7 +70,7 @@ def _iou(a: Superquadric, b: Superquadric, lower: np.ndarray, upper: np.ndarray,
 def _column(body: np.ndarray, m: np.ndarray, x: float, y: float, z0: float, step: float, count: int) -> tuple[int, int]:
     """First and last grid index inside the body on the column (x, y, z0 + k step)."""
     origin = in_object_frame(m, x - body[5], y - body[6], z0 - body[7])
-    form = body[0], body[1], body[2], body[3], body[4]
+    form = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
     hit, first, last = ray_interval(origin, (m[2, 0], m[2, 1], m[2, 2]), form)
     if not hit:
         return 0, -1

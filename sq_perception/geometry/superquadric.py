@@ -13,19 +13,29 @@ is below 1 inside, 1 on the surface and above 1 outside.  The gauge
 is a norm for e1, e2 <= 2: degree one, convex, g = 1 on the surface.  All else is computed from g: F = g^(2/e1), and the
 thesis' adjusted function F^e1 = g^2 (equation 6.4).
 
+A tapered body (A. Barr 1984; F. Solina, R. Bajcsy, PAMI 12(2), 1990) has the gauge g(x', y', z) with
+
+    x' = x / (1 + k_x z/a3),    y' = y / (1 + k_y z/a3),    |k| < 1:
+
+its section at z is scaled by 1 + k z/a3, from 1 - k at its lower to 1 + k at its upper end; a1 and a2 are the half sizes
+of the section in the middle.  Beyond the narrow end the scale stays that of the end.  g is then no norm, and the body
+need not be convex: for exponents up to 1 it is where k_x = k_y and |k| < 0.7, and nearly so otherwise.
+
 Each of the two p-norms, p = 2/e, is evaluated in ratio form: the larger term is factored out and the rest goes through
 log1p.  Nothing overflows down to e = 0.01, no epsilon shifts the surface, and gradients are finite on the axes.
 
 Conventions
 -----------
 Metres and radians; ``rotation`` is a quaternion x y z w from object to parent frame, ``translation`` the centre in the
-parent frame.  The flat order is a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw (thesis, equation 3.12).
+parent frame.  The flat order is a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw (thesis, equation 3.12); where tapers are known, k_x
+and k_y come after it.
 
 Reference: A. Jaklic, A. Leonardis, F. Solina, Segmentation and Recovery of Superquadrics, Kluwer 2000, chapter 2.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -39,9 +49,14 @@ from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, checke
 Array = Any
 """A NumPy array or a torch tensor."""
 
-FLAT_LENGTH = 12
+FLAT_LENGTH, NUMBERS = 12, 14
+"""Numbers of a body without and with its taper."""
+_SCAN, _HALVINGS = 7, 50
+"""Points of a tapered body's profile from which its support is sought, and steps of the search."""
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
+_ENDS = np.array([1.0, -1.0, -1.0, 1.0])
+"""Which of the half turns exchange the ends of a body's z axis, and with them the sign of its taper."""
 _QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
 
 
@@ -59,6 +74,8 @@ class Superquadric:
         The centre in the parent frame, metres.
     rotation : (..., 4)
         Unit quaternion x y z w, object to parent.
+    taper : (..., 2), optional
+        k_x and k_y, each from -0.95 to 0.95; 0 if not given.
 
     Raises
     ------
@@ -71,11 +88,15 @@ class Superquadric:
     shape: Array
     translation: Array
     rotation: Array
+    taper: Array = None
 
     def __post_init__(self) -> None:
-        parts = [self.size, self.shape, self.translation, self.rotation]
+        taper = self.taper
+        if taper is None:
+            taper = 0 * self.size[..., :2] if is_torch_array(self.size) else np.zeros(2)
+        parts = [self.size, self.shape, self.translation, self.rotation, taper]
         if (numbers := one_body(parts)) is not None:
-            fixed = numbers[0:3], numbers[3:5], numbers[5:8], numbers[8:12]
+            fixed = numbers[0:3], numbers[3:5], numbers[5:8], numbers[8:12], numbers[12:14]
             self.__dict__.update(zip(LENGTHS, fixed, strict=True))
             return
         tensors = [is_torch_array(part) for part in parts]
@@ -87,6 +108,7 @@ class Superquadric:
             if part.ndim == 0 or part.shape[-1] != length:
                 raise ValueError(f"{name}: expected shape (..., {length}), got {tuple(part.shape)}")
         if tensors[0]:
+            self.__dict__["taper"] = taper
             return
         parts[3] = checked_turn(parts)
         batch = np.broadcast_shapes(*{part.shape[:-1] for part in parts})
@@ -106,7 +128,7 @@ class Superquadric:
         """Index the leading dimensions."""
         if not self.batch_shape:  # a slice would be of its numbers
             raise TypeError("a single Superquadric cannot be indexed")
-        return Superquadric(self.size[index], self.shape[index], self.translation[index], self.rotation[index])
+        return Superquadric(*(getattr(self, name)[index] for name in LENGTHS))
 
     def __len__(self) -> int:
         if not self.batch_shape:
@@ -116,24 +138,43 @@ class Superquadric:
     def __iter__(self) -> Iterator[Superquadric]:
         return (self[i] for i in range(len(self)))
 
+    @property
+    def is_tapered(self) -> bool:
+        """Whether any of the bodies tapers."""
+        return bool((self.taper != 0).any())
+
     def to_flat(self) -> Array:
-        """Flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw."""
+        """Flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw.
+
+        Raises
+        ------
+        ValueError
+            For bodies that taper, as this order has no place for it.
+        """
+        if self.is_tapered:
+            raise ValueError("expected bodies without a taper; `to_numbers` has a place for it")
+        return self.to_numbers()[..., :FLAT_LENGTH]
+
+    def to_numbers(self) -> Array:
+        """All parameters (..., 14): those of :meth:`to_flat`, then k_x k_y."""
         xp = array_namespace(self.size)
-        return xp.concat([self.size, self.shape, self.translation, self.rotation], axis=-1)
+        return xp.concat([self.size, self.shape, self.translation, self.rotation, self.taper], axis=-1)
 
     @classmethod
     def from_flat(cls, flat: Array) -> Superquadric:
-        """The inverse of :meth:`to_flat`."""
+        """The inverse of :meth:`to_flat` and, for arrays (..., 14), of :meth:`to_numbers`."""
         if not is_torch_array(flat):
             flat = np.asarray(flat, dtype=float)
-        if flat.ndim == 0 or flat.shape[-1] != FLAT_LENGTH:
+        if flat.ndim == 0 or flat.shape[-1] not in (FLAT_LENGTH, NUMBERS):
             raise ValueError(f"expected flat parameters of shape (..., {FLAT_LENGTH}), got {tuple(flat.shape)}")
-        return cls(flat[..., 0:3], flat[..., 3:5], flat[..., 5:8], flat[..., 8:12])
+        taper = flat[..., FLAT_LENGTH:] if flat.shape[-1] == NUMBERS else None
+        return cls(flat[..., 0:3], flat[..., 3:5], flat[..., 5:8], flat[..., 8:12], taper)
 
     @classmethod
-    def at_origin(cls, size: np.ndarray, shape: np.ndarray) -> Superquadric:
-        """Bodies of these sizes (..., 3) and exponents (..., 2) in their own frame."""
-        return cls(np.asarray(size, float), np.asarray(shape, float), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    def at_origin(cls, size: np.ndarray, shape: np.ndarray, taper: np.ndarray | None = None) -> Superquadric:
+        """Bodies of these sizes (..., 3), exponents (..., 2) and tapers (..., 2) in their own frame."""
+        size, shape = np.asarray(size, float), np.asarray(shape, float)
+        return cls(size, shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), taper)
 
     @classmethod
     def stack(cls, bodies: list[Superquadric]) -> Superquadric:
@@ -141,7 +182,21 @@ class Superquadric:
         if not bodies:
             return cls(np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 4)))
         xp = array_namespace(bodies[0].size)
-        return cls.from_flat(xp.stack([body.to_flat() for body in bodies]))
+        return cls.from_flat(xp.stack([body.to_numbers() for body in bodies]))
+
+    def untapered(self) -> Superquadric:
+        """The bodies without their tapers, as large as their largest sections: they enclose them, in the same boxes."""
+        return Superquadric(self.size * self._largest(), self.shape, self.translation, self.rotation)
+
+    def with_taper(self, taper: Array) -> Superquadric:
+        """The inverse of :meth:`untapered`, for untapered bodies."""
+        shaped = Superquadric(self.size, self.shape, self.translation, self.rotation, taper)
+        return Superquadric(self.size / shaped._largest(), self.shape, self.translation, self.rotation, taper)
+
+    def _largest(self) -> Array:
+        """Half sizes (..., 3) of the box around a body, as multiples of its own half sizes."""
+        xp = array_namespace(self.size)
+        return 1 + xp.concat([xp.abs(self.taper), 0 * self.taper[..., :1]], axis=-1)
 
     # Motion
 
@@ -162,11 +217,12 @@ class Superquadric:
     def transformed(self, rotation: Array, translation: Array, scale: float | Array = 1.0) -> Superquadric:
         """The same body in another frame: p_new = scale * R(rotation) p + translation.
 
-        Half sizes grow with ``scale`` (a number, or an array (..., 1)); shape stays.
+        Half sizes grow with ``scale`` (a number, or an array (..., 1)); shape and taper stay.
         """
         matrix = quaternions.to_matrix(rotation)
         moved = (matrix @ self.translation[..., None])[..., 0] * scale + translation
-        return Superquadric(self.size * scale, self.shape, moved, quaternions.multiply(rotation, self.rotation))
+        turned = quaternions.multiply(rotation, self.rotation)
+        return Superquadric(self.size * scale, self.shape, moved, turned, self.taper)
 
     # The surface
 
@@ -175,8 +231,16 @@ class Superquadric:
         p = self.to_object(points)
         xp = array_namespace(p)
         q = xp.abs(p) / self.size[..., None, :]
+        scale = self._section(p)
         e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        return nested_norm(q[..., 0], q[..., 1], q[..., 2], e1, e2)
+        return nested_norm(q[..., 0] / scale[..., 0], q[..., 1] / scale[..., 1], q[..., 2], e1, e2)
+
+    def _section(self, points: Array) -> Array:
+        """Scale (..., N, 2) of the sections at points (..., N, 3) of the object's frame."""
+        xp = array_namespace(points)
+        high = (points[..., 2] / self.size[..., None, 2])[..., None]
+        taper = self.taper[..., None, :]
+        return xp.maximum(1 + taper * high, 1 - xp.abs(taper))
 
     def inside_outside(self, points: Array) -> Array:
         """F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow to inf far from sharp bodies."""
@@ -213,9 +277,15 @@ class Superquadric:
         p = self.to_object(points)
         xp = array_namespace(p)
         q = xp.abs(p) / self.size[..., None, :]
+        scale = self._section(p)
         e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        gauge, slopes = nested_norm_and_slopes(q[..., 0], q[..., 1], q[..., 2], e1, e2)
+        gauge, slopes = nested_norm_and_slopes(q[..., 0] / scale[..., 0], q[..., 1] / scale[..., 1], q[..., 2], e1, e2)
         gradient = xp.stack(slopes, axis=-1) * xp.sign(p) / self.size[..., None, :]
+        across = gradient[..., :2] / scale
+        taper = self.taper[..., None, :]
+        grows = xp.where(scale > 1 - xp.abs(taper), taper, 0 * taper) / self.size[..., None, 2:]
+        along = gradient[..., 2] - xp.sum(across * p[..., :2] * grows / scale, axis=-1)
+        gradient = xp.concat([across, along[..., None]], axis=-1)
         return gauge, gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
 
     def parametric_points(self, eta: Array, omega: Array) -> Array:
@@ -234,23 +304,28 @@ class Superquadric:
             ],
             axis=-1,
         )
+        scale = 1 + self.taper[..., None, :] * unit[..., 2:]
+        unit = xp.concat([unit[..., :2] * scale, unit[..., 2:]], axis=-1)
         return self.to_parent(unit * self.size[..., None, :])
 
     def sample_surface(self, count: int, rng: np.random.Generator, oversampling: int = 12) -> np.ndarray:
         """Nearly uniform surface points (..., count, 3) in the parent frame; NumPy bodies only.
 
-        Random directions v on the sphere, stretched by the half sizes, hit the surface at p = a v / g.  Such a point
-        stands for the area a1 a2 a3 r^3 |grad g| (r = 1 / g(a v), from the volume of a thin cone), so that systematic
-        resampling with this weight out of ``oversampling * count`` candidates is uniform in area.
+        Random directions v on the sphere, stretched by the half sizes, hit the untapered surface at p = a v / g.  Such
+        a point stands for the area a1 a2 a3 r^3 |grad g| (r = 1 / g(a v), from the volume of a thin cone), so that
+        systematic resampling with this weight out of ``oversampling * count`` candidates is uniform in area.  A taper
+        moves the points along, and changes areas by f_x f_y times the change of |grad g|, f the scale of the section.
         """
         shape = (*self.batch_shape, oversampling * count, 3)
         direction = rng.standard_normal(shape)
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
-        local = Superquadric(self.size, self.shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+        local = Superquadric.at_origin(self.size, self.shape, self.taper)
         stretched = direction * self.size[..., None, :]
-        gauge = local.gauge(stretched)
+        gauge = Superquadric.at_origin(self.size, self.shape).gauge(stretched)
         points = stretched / gauge[..., None]
-        area = np.linalg.norm(local.gauge_gradient(points), axis=-1) / gauge**3
+        scale = local._section(points)
+        points[..., :2] *= scale
+        area = np.linalg.norm(local.gauge_gradient(points), axis=-1) / gauge**3 * np.prod(scale, axis=-1)
         cumulative = np.cumsum(area, axis=-1)
         cumulative /= cumulative[..., -1:]
         steps = (np.arange(count) + rng.random((*self.batch_shape, 1))) / count
@@ -263,30 +338,40 @@ class Superquadric:
     # Closed forms
 
     def volume(self) -> np.ndarray:
-        """Volume (...), cubic metres, of NumPy bodies: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2)."""
+        """Volume (...), cubic metres, of NumPy bodies: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2) (1 + k_x k_y m).
+
+        m = B(3 e1/2, e1 + 1) / B(e1/2, e1 + 1) is the mean of (z/a3)^2 over the untapered body.
+        """
         from scipy.special import beta  # here: a node that recovers does without
 
         size, shape = self.size, self.shape
         e1, e2 = shape[..., 0], shape[..., 1]
-        return 2 * np.prod(size, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
+        straight = 2 * np.prod(size, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
+        return straight * (1 + np.prod(self.taper, axis=-1) * beta(1.5 * e1, e1 + 1) / beta(0.5 * e1, e1 + 1))
 
     def support(self, directions: Array) -> Array:
         """Support function: max of n.p over the body, minus n.t, for unit directions n (..., N, 3), shape (..., N).
 
         The dual of the gauge: the same nested norm of a * |R^T n| with each exponent p = 2/e replaced by its conjugate
         2/(2 - e), that is e by 2 - e, but for octahedra.  The body touches the plane n.p = n.t + support.
+
+        Of a body that tapers it is the largest support of its sections, see :func:`support_of_sections`.
         """
         n = directions @ self.rotation_matrix
         xp = array_namespace(n)
         q = xp.abs(n) * self.size[..., None, :]
         conjugate = xp.clip(2 - self.shape, min=LEAST_CONJUGATE)[..., None, :]
+        if self.is_tapered:
+            return support_of_sections(q, n[..., 2] * self.size[..., None, 2], conjugate, self.taper[..., None, :])
         return nested_norm(q[..., 0], q[..., 1], q[..., 2], conjugate[..., 0], conjugate[..., 1])
 
     def bounding_box(self) -> tuple[Array, Array]:
         """Lower and upper corner (..., 3) of the axis-aligned box in the parent frame."""
         xp = array_namespace(self.size)
-        extent = self.support(xp.eye(3, dtype=self.size.dtype))
-        return self.translation - extent, self.translation + extent
+        ways = xp.eye(3, dtype=self.size.dtype)
+        above = self.support(ways)
+        below = self.support(-ways) if self.is_tapered else above
+        return self.translation - below, self.translation + above
 
     # The same body, other numbers
 
@@ -298,11 +383,13 @@ class Superquadric:
         xp = array_namespace(self.size)
         turns = np.concatenate([_HALF_TURNS, quaternions.multiply(_QUARTER_TURN, _HALF_TURNS)])
         exchanged = xp.stack([self.size[..., k] for k in (1, 0, 2)], axis=-1)
+        taper, other = self.taper, xp.stack([self.taper[..., k] for k in (1, 0)], axis=-1)
+        tapers = [taper, -taper, -taper, taper, other, -other, -other, other]
         forms = []
-        for turn, size in zip(turns, [self.size] * 4 + [exchanged] * 4, strict=True):
+        for turn, size, ends in zip(turns, [self.size] * 4 + [exchanged] * 4, tapers, strict=True):
             step = xp.asarray(turn, dtype=self.rotation.dtype) + xp.zeros_like(self.rotation)
             turned = quaternions.multiply(self.rotation, step)
-            forms.append(xp.concat([size, self.shape, self.translation, turned], axis=-1))
+            forms.append(xp.concat([size, self.shape, self.translation, turned, ends], axis=-1))
         return Superquadric.from_flat(xp.stack(forms))
 
     def canonical_form(self) -> Superquadric:
@@ -313,21 +400,67 @@ class Superquadric:
         Where a1 = a2 no quarter turn is tried, and of two forms of equal angles either may come out: such bodies have
         several representatives.
         """
-        size, q = self.size, self.rotation
+        size, q, taper = self.size, self.rotation, self.taper
         if not self.batch_shape:  # numbers of a single body: a fourth of the time
             if size[0] < size[1]:
-                size, q = size[[1, 0, 2]], quaternions.multiply(q, _QUARTER_TURN)
+                size, q, taper = size[[1, 0, 2]], quaternions.multiply(q, _QUARTER_TURN), taper[::-1]
             x, y, z, w = (round(abs(part), 12) for part in q.tolist())
             parts = w, x, y, z
-            q = quaternions.multiply(q, _HALF_TURNS[parts.index(max(parts))])
-            return Superquadric(size, self.shape, self.translation, -q if q[3] < 0 else q)
+            half = parts.index(max(parts))
+            q = quaternions.multiply(q, _HALF_TURNS[half])
+            taper = taper * _ENDS[half] + 0.0  # no -0
+            return Superquadric(size, self.shape, self.translation, -q if q[3] < 0 else q, taper)
         swapped = size[..., :1] < size[..., 1:2]
         size = np.where(swapped, size[..., [1, 0, 2]], size)
         q = quaternions.multiply(q, np.where(swapped, _QUARTER_TURN, _HALF_TURNS[0]))
         largest = np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1)
         q = quaternions.multiply(q, _HALF_TURNS[largest])
         q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
-        return Superquadric(size, self.shape, self.translation, q)
+        taper = np.where(swapped, taper[..., ::-1], taper) * _ENDS[largest][..., None] + 0.0
+        return Superquadric(size, self.shape, self.translation, q, taper)
+
+
+def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) -> Array:
+    """Support (..., N) of tapered bodies: the largest one of their sections.
+
+    The section at z = t a3 has n_z a3 t + sigma S(t): (t, sigma) runs on the profile, a unit ball, and S is the dual
+    norm of (a1 f1 n_x, a2 f2 n_y).  At the maximum the normal of the profile is along (A, S), A = n_z a3 + sigma S'.
+    The best of some points of the profile is followed to there by halving, by the sine s of its normal.
+
+    Parameters
+    ----------
+    q : (..., N, 3)
+        a |n|, n the direction in the object's frame.
+    along : (..., N)
+        n_z a3.
+    conjugate : (..., 1, 2)
+        2 - e.
+    taper : (..., 1, 2)
+    """
+    xp = array_namespace(q)
+    e1, e2 = conjugate[..., 0], conjugate[..., 1]
+    q, taper = q + 0 * taper[..., :1], taper + 0 * q[..., :2]
+
+    def at(s: Array) -> tuple[Array, Array]:
+        """The support by one point, and by how much its normal is above that of the maximum."""
+        cosine = xp.sqrt(xp.clip(1 - s * s, min=0.0))
+        _, sigma, high = _p_norm_and_slopes(cosine, xp.abs(s), e1)
+        t = high * xp.sign(s)
+        u, v = q[..., 0] * (1 + taper[..., 0] * t), q[..., 1] * (1 + taper[..., 1] * t)
+        across, by_u, by_v = _p_norm_and_slopes(u, v, e2)
+        tilted = along + sigma * (by_u * q[..., 0] * taper[..., 0] + by_v * q[..., 1] * taper[..., 1])
+        return along * t + sigma * across, s * across - cosine * tilted
+
+    sines = xp.sin(math.pi * (xp.arange(_SCAN) / (_SCAN - 1) - 0.5))
+    shape = along + 0 * q[..., 0]
+    values = xp.stack([at(s + 0 * shape)[0] for s in sines], axis=-1)
+    best = xp.argmax(values, axis=-1)
+    low, high = sines[xp.clip(best - 1, min=0)], sines[xp.clip(best + 1, max=_SCAN - 1)]
+    for _ in range(_HALVINGS):
+        middle = (low + high) / 2
+        _, above = at(middle)
+        low, high = xp.where(above > 0, low, middle), xp.where(above > 0, middle, high)
+    return xp.maximum(at((low + high) / 2)[0], xp.max(values, axis=-1))
 
 
 def nested_norm(x: Array, y: Array, z: Array, e1: Array, e2: Array) -> Array:

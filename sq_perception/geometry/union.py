@@ -1,4 +1,4 @@
-"""Unions of superquadrics, as flat parameters (k, 12), compiled: the support function of their hull, and motion.
+"""Unions of superquadrics, as flat parameters (k, 12) or, where they taper, (k, 14), compiled: the support function of their hull, and motion.
 
 The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  Things drawn by the
 thousand for training need it some ten times each; :class:`Superquadric` computes the same for one body at a time.
@@ -14,27 +14,28 @@ from sq_perception.geometry.superquadric import Superquadric
 
 def support_of_union(parts: Superquadric, directions: np.ndarray) -> np.ndarray:
     """max n.p over the hull of a batch (k,) of NumPy bodies, for directions n (J, 3), shape (J,)."""
-    return flat_support(np.ascontiguousarray(parts.to_flat(), dtype=float), np.asarray(directions, dtype=float))
+    return flat_support(np.ascontiguousarray(parts.to_numbers(), dtype=float), np.asarray(directions, dtype=float))
 
 
 @kernel
 def flat_support(flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """The support function (J,) of :func:`support_of_union`, for flat parameters (k, 12)."""
+    """The support function (J,) of :func:`support_of_union`, for flat parameters (k, 12 or 14)."""
     reach = np.full(directions.shape[0], -np.inf)
     for k in range(flat.shape[0]):
-        m = _matrix(flat[k, 8:])
+        m = _matrix(flat[k, 8:12])
+        k1, k2 = (flat[k, 12], flat[k, 13]) if flat.shape[1] > 12 else (0.0, 0.0)
         for j in range(directions.shape[0]):
             x, y, z = directions[j]
             nx, ny, nz = in_object_frame(m, x, y, z)
             far = x * flat[k, 5] + y * flat[k, 6] + z * flat[k, 7]
-            far += support(nx, ny, nz, flat[k, 0], flat[k, 1], flat[k, 2], flat[k, 3], flat[k, 4])
+            far += support(nx, ny, nz, flat[k, 0], flat[k, 1], flat[k, 2], flat[k, 3], flat[k, 4], k1, k2)
             reach[j] = max(reach[j], far)
     return reach
 
 
 @kernel
 def moved(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Flat parameters (k, 12) after p -> R p + shift, the rotation given as a unit quaternion (4,)."""
+    """Flat parameters (k, 12 or 14) after p -> R p + shift, the rotation given as a unit quaternion (4,)."""
     m = _matrix(rotation)
     out = flat.copy()
     a, b, c, d = rotation
@@ -43,7 +44,7 @@ def moved(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarr
             out[k, 5 + axis] = shift[axis]
             for other in range(3):
                 out[k, 5 + axis] += m[axis, other] * flat[k, 5 + other]
-        x, y, z, w = flat[k, 8:]
+        x, y, z, w = flat[k, 8:12]
         out[k, 8] = d * x + a * w + b * z - c * y
         out[k, 9] = d * y - a * z + b * w + c * x
         out[k, 10] = d * z + a * y - b * x + c * w

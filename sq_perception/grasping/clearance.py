@@ -44,8 +44,8 @@ def gaps_to_bodies(
         Centres and half sizes in the frame of the TCP.
     owner : int (k,)
         The body that each is to grasp.
-    flat, turns : (n, 12), (n, 3, 3)
-        Flat parameters and rotation matrices of the bodies.
+    flat, turns : (n, 14), (n, 3, 3)
+        Flat parameters with tapers, and rotation matrices of the bodies.
     """
     least = np.full(len(frames), FAR)
     which = np.full(len(frames), -1)
@@ -56,7 +56,7 @@ def gaps_to_bodies(
         for body in range(len(flat)):
             if body == owner[k]:
                 continue
-            size = flat[body, :3]
+            size = _half(flat[body])
             radius = math.sqrt(size[0] ** 2 + size[1] ** 2 + size[2] ** 2)
             _into(frame, flat[body, 5:8], centre)
             turned = False
@@ -101,12 +101,13 @@ def _gap(
             best = gap
             way[:] = 0.0
             way[i] = 1.0 if centre[i] > box[i] else -1.0
+    own = _half(body)
     for j in range(3):
         along, half = 0.0, 0.0
         for i in range(3):
             along += axes[i, j] * (centre[i] - box[i])
             half += abs(axes[i, j]) * box[3 + i]
-        gap = abs(along) - half - body[j]
+        gap = abs(along) - half - own[j]
         if gap > best:
             best = gap
             for i in range(3):
@@ -132,8 +133,18 @@ def _gap(
 
 @inline_kernel
 def _reach(m: np.ndarray, body: np.ndarray) -> float:
-    """The support function of a body (12,) along m (3,) in its own frame."""
-    return support(m[0], m[1], m[2], body[0], body[1], body[2], body[3], body[4])
+    """The support function of a body (14,) along m (3,) in its own frame, or against it if that is more."""
+    a1, a2, a3, e1, e2, k1, k2 = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
+    ahead = support(m[0], m[1], m[2], a1, a2, a3, e1, e2, k1, k2)
+    if k1 == 0.0 and k2 == 0.0:
+        return ahead
+    return max(ahead, support(-m[0], -m[1], -m[2], a1, a2, a3, e1, e2, k1, k2))
+
+
+@inline_kernel
+def _half(body: np.ndarray) -> tuple[float, float, float]:
+    """Half sizes of the box around a body (14,) along its own axes."""
+    return body[0] * (1.0 + abs(body[12])), body[1] * (1.0 + abs(body[13])), body[2]
 
 
 @inline_kernel

@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sq_perception.geometry.kernels import conjugate, gauge_derivatives, kernel, p_norm
+from sq_perception.geometry.kernels import gauge_derivatives, kernel, support_derivatives
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
 UNKNOWN = 0.1
@@ -55,8 +55,8 @@ class KnownBodies:
 
     Attributes
     ----------
-    flat, turns : (n, 12), (n, 3, 3)
-        Flat parameters and rotation matrices.
+    flat, turns : (n, 14), (n, 3, 3)
+        Flat parameters with tapers, and rotation matrices.
     covariance : (n, 9, 9)
         Covariances of sizes, centre and turn.
     """
@@ -74,7 +74,7 @@ class KnownBodies:
         ValueError
             For covariances of another shape.
         """
-        flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
+        flat, turns = np.ascontiguousarray(bodies.to_numbers(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
         wide = np.zeros((len(flat), 9))
         wide[:, :3] = UNKNOWN * bodies.size
         wide[:, 3:6] = UNKNOWN * bodies.size.mean(axis=1, keepdims=True)
@@ -113,7 +113,7 @@ class KnownBodies:
     def middle_angles(self, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Angle (k,) between directions (k, 3) and the normals where the lines through the centre along them leave.
 
-        The gradient of the gauge is the same all along such a line.
+        The gradient of the gauge is the same all along such a line, but for tapers, which are left out of account.
         """
         size, e1, e2 = self.flat[owner, :3], self.flat[owner, 3], self.flat[owner, 4]
         q = np.abs((directions[:, None] @ self.turns[owner])[:, 0]) / size
@@ -150,18 +150,16 @@ def _reaches(
     flat: np.ndarray, turns: np.ndarray, covariance: np.ndarray, owner: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     reach, sigma = np.empty(len(owner)), np.empty(len(owner))
-    m, q, farthest, gradient = np.empty(3), np.empty(3), np.empty(3), np.empty(9)
+    m, farthest, gradient = np.empty(3), np.empty(3), np.empty(9)
     for k in range(len(owner)):
         body, n = flat[owner[k]], directions[k]
         for i in range(3):
             m[i] = n[0] * turns[owner[k], 0, i] + n[1] * turns[owner[k], 1, i] + n[2] * turns[owner[k], 2, i]
-            q[i] = body[i] * abs(m[i])
-        h, h_x, h_y, _ = p_norm(q[0], q[1], conjugate(body[4]))
-        reach[k], by_h, by_z, _ = p_norm(h, q[2], conjugate(body[3]))
-        gradient[0], gradient[1], gradient[2] = by_h * h_x, by_h * h_y, by_z
+        a1, a2, a3, e1, e2, k1, k2 = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
+        reach[k], x, y, z, _, _, _, _ = support_derivatives(m[0], m[1], m[2], a1, a2, a3, e1, e2, k1, k2)
+        farthest[0], farthest[1], farthest[2] = x, y, z
         for i in range(3):
-            farthest[i] = gradient[i] * body[i] * np.sign(m[i])
-            gradient[i] *= abs(m[i])
+            gradient[i] = farthest[i] * m[i] / body[i]
             gradient[3 + i] = n[i]
         gradient[6] = farthest[1] * m[2] - farthest[2] * m[1]
         gradient[7] = farthest[2] * m[0] - farthest[0] * m[2]
@@ -200,29 +198,30 @@ def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, c
     """Where lines from at (3, k) along way (3, k), in a body's own frame, leave it, and the cosine to the normal there.
 
     They start where they leave the box around the body: g is convex along them, and Newton's steps from outside stay
-    outside.  A step is one loop over all lines that has no branch and few arrays, so that it becomes vector code.
+    outside, or come near to the surface from inside where a body tapers.  A step is one loop over all lines that has no branch and few arrays, so that it becomes vector code.
     """
-    a1, a2, a3, e1, e2 = body[:5]
+    a1, a2, a3, e1, e2, k1, k2 = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
+    half = a1 * (1.0 + abs(k1)), a2 * (1.0 + abs(k2)), a3
     x, y, z = at[0], at[1], at[2]
     u, v, w = way[0], way[1], way[2]
     for k in range(len(run)):
         run[k] = np.inf
         for i in range(3):
             if way[i, k] != 0.0:
-                run[k] = min(run[k], (body[i] - at[i, k] * np.sign(way[i, k])) / abs(way[i, k]))
+                run[k] = min(run[k], (half[i] - at[i, k] * np.sign(way[i, k])) / abs(way[i, k]))
         run[k] = max(run[k], 0.0)
     for _ in range(_NEWTON_STEPS):
         for k in range(len(run)):
             t = run[k]
-            value, g_x, g_y, g_z, _, _ = gauge_derivatives(
-                x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2
+            value, g_x, g_y, g_z, _, _, _, _ = gauge_derivatives(
+                x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2, k1, k2
             )
             slope = g_x * u[k] + g_y * v[k] + g_z * w[k]
             run[k] = t - (value - 1.0) / (slope if slope > _GRAZING else np.nan)
     for k in range(len(run)):
         t = run[k]
-        _, g_x, g_y, g_z, _, _ = gauge_derivatives(
-            x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2
+        _, g_x, g_y, g_z, _, _, _, _ = gauge_derivatives(
+            x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2, k1, k2
         )
         slope = g_x * u[k] + g_y * v[k] + g_z * w[k]
         cosine[k] = slope / math.sqrt(g_x * g_x + g_y * g_y + g_z * g_z)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import box_interval, in_object_frame, parallel_kernel, ray_entry
+from sq_perception.geometry.kernels import in_object_frame, inside_box, parallel_kernel, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera, Lens
 
@@ -43,11 +43,11 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
     if len(bodies.batch_shape) > 1:
         raise ValueError(f"bodies: expected one or a batch (n,), got a batch of shape {bodies.batch_shape}")
     if not bodies.batch_shape:
-        bodies = Superquadric.from_flat(bodies.to_flat()[None])
+        bodies = Superquadric.from_flat(bodies.to_numbers()[None])
     depth = np.full((camera.height, camera.width), np.inf)
     index = np.full((camera.height, camera.width), -1, dtype=np.int32)
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
-    flat = np.ascontiguousarray(bodies.to_flat(), dtype=float)
+    flat = np.ascontiguousarray(bodies.to_numbers(), dtype=float)
     corners = np.stack(Superquadric.from_flat(flat).bounding_box(), axis=1)[:, _CORNERS, [0, 1, 2]]
     _render_bodies(flat, matrices, windows(corners, camera), camera.lens, depth, index)
     return depth, index
@@ -86,6 +86,7 @@ def _render_bodies(
             if v < top or v >= bottom:
                 continue
             a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
+            form = a1, a2, a3, e1, e2, flat[k, 12], flat[k, 13]
             m = matrices[k]
             for u in range(left, right):
                 x, y = (u - cx) / fx, (v - cy) / fy
@@ -95,10 +96,10 @@ def _render_bodies(
                     px, py, rx, ry = x - t1, y - t2, 0.0, 0.0
                 origin, way = in_object_frame(m, px, py, -t3), in_object_frame(m, rx, ry, 1.0)
                 # What begins behind something nearer needs no search.
-                t_in, _ = box_interval(origin, way, (a1, a2, a3))
+                t_in, _ = inside_box(origin, way, form)
                 if t_in >= depth[v, u]:
                     continue
-                hit, t = ray_entry(origin, way, (a1, a2, a3, e1, e2))
+                hit, t = ray_entry(origin, way, form)
                 if hit and t < depth[v, u] and (t > 0.0 or not pinhole):
                     depth[v, u] = t
                     index[v, u] = k

@@ -39,13 +39,14 @@ def agreement(
 ) -> float:
     """Intersection over union of what the view and the body show, at every ``stride``-th row and column.
 
-    ``image`` (n, n) is that of a canonical view; the body is ``parameters`` a1 a2 a3 e1 e2 t1 t2 t3 and ``rotation``
+    ``image`` (n, n) is that of a canonical view; the body is ``parameters`` a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y and ``rotation``
     (3, 3), object to canonical frame.
     """
     n = image.shape[0]
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    a1, a2, a3, e1, e2, t1, t2, t3, k1, k2 = parameters
     reach = math.sqrt(1.0 + _NEGLIGIBLE / sharpness)
     ez1, ez2, ez3 = rotation[2]
+    wide = reach * a1 * (1.0 + abs(k1)), reach * a2 * (1.0 + abs(k2)), reach * a3
     depths, lefts = np.empty(_AT_ONCE), np.empty(_AT_ONCE)
     difference, union = 0.0, 0.0
     for i in range(0, n, stride):
@@ -56,7 +57,7 @@ def agreement(
             ox = rotation[0, 0] * x + rotation[1, 0] * y - ez1 * t3
             oy = rotation[0, 1] * x + rotation[1, 1] * y - ez2 * t3
             oz = rotation[0, 2] * x + rotation[1, 2] * y - ez3 * t3
-            lowest, highest = box_interval((ox, oy, oz), (ez1, ez2, ez3), (reach * a1, reach * a2, reach * a3))
+            lowest, highest = box_interval((ox, oy, oz), (ez1, ez2, ez3), wide)
             # Voxel k = 0 .. n - 1 from the viewer has its centre at z = 1 - (k + 1/2) / n.
             k = math.ceil(max((1.0 - highest) * n - 0.5, 0.0)) if lowest <= highest else n
             last = math.floor(min((1.0 - lowest) * n - 0.5, n - 1.0)) if lowest <= highest else -1
@@ -65,7 +66,7 @@ def agreement(
             while k <= last and depth < _NEGLIGIBLE:
                 for v in range(_AT_ONCE):
                     z = 1.0 - (k + v + 0.5) / n
-                    g = gauge(ox + z * ez1, oy + z * ez2, oz + z * ez3, a1, a2, a3, e1, e2)
+                    g = gauge(ox + z * ez1, oy + z * ez2, oz + z * ez3, a1, a2, a3, e1, e2, k1, k2)
                     outside = min(sharpness * (g * g - 1.0), 2.0 * _NEGLIGIBLE)
                     depths[v] = tau / (1.0 + exp2(_PER_E * outside))
                 for v in range(_AT_ONCE):

@@ -157,8 +157,7 @@ class Findings:
         """Surface of each body that did not fail, in the body's own frame; made when it is first asked for."""
         shown = self.array.recovered
         return tuple(
-            triangles(Superquadric.at_origin(*form), MARKER_RESOLUTION)
-            for form in zip(shown.size, shown.shape, strict=True)
+            triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(shown)
         )
 
     def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
@@ -182,10 +181,10 @@ class Findings:
         """
         shown = self.array.recovered
         turns = poses.matrices(poses.unit_quaternions(shown.rotation))
-        surfaces = []
+        surfaces, bodies = [], _in_own_frames(shown)
         for k, (vertices, faces) in enumerate(self.meshes):
             turn, centre = turns[k].T, shown.translation[k].astype(float)
-            lines = outline(Superquadric.at_origin(shown.size[k], shown.shape[k]))
+            lines = outline(bodies[k])
             surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
         return markers(surfaces, self.shown_ids, self.header, alpha=alpha, previous_ids=previous_ids, types=types)
 
@@ -214,7 +213,8 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
     return SuperquadricArray(
-        **{name: getattr(bodies, name) for name in _OF_A_BODY},
+        **{name: getattr(bodies.untapered(), name) for name in _OF_A_BODY},
+        taper=bodies.taper,
         id=np.array(found.ids),
         **{name: np.array([getattr(body, name) for body in recovery.bodies]) for name in _OF_EACH_BODY},
         **{name: np.array(values, np.uint32) for name, values in found.columns.items()},
@@ -226,7 +226,13 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
 
 def superquadrics(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, in its frame."""
-    return Superquadric(**{name: getattr(array, name).astype(float) for name in _OF_A_BODY})
+    bodies = Superquadric(**{name: getattr(array, name).astype(float) for name in _OF_A_BODY})
+    return bodies.with_taper(array.taper.astype(float))
+
+
+def _in_own_frames(array: SuperquadricArray) -> Superquadric:
+    """The bodies (n,) of a message, each in its own frame."""
+    return Superquadric.at_origin(array.size, array.shape).with_taper(array.taper.astype(float))
 
 
 def drawn(array: SuperquadricArray, bodies: Superquadric) -> Bodies:

@@ -110,7 +110,8 @@ def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
 
 
 def _parameters(body: Superquadric) -> dict[str, Any]:
-    return {name: getattr(body, name) for name in ("size", "shape", "translation", "rotation")}
+    box = body.untapered()
+    return {name: getattr(box, name) for name in ("size", "shape", "translation", "rotation")} | {"taper": body.taper}
 
 
 def document(options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]]) -> str:
@@ -127,6 +128,7 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
         "shape": ["e1", "e2"],
         "translation": ["x", "y", "z"],
         "rotation": ["qx", "qy", "qz", "qw"],
+        "taper": ["kx", "ky"],
         "seen": [f"seen_a{k}" for k in axes],
     }
     single = ("score", "residual", "pixels", "label", "message")

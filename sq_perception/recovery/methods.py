@@ -90,7 +90,7 @@ def score(obj: SeenObject, fit: Fit, options: RecoveryOptions) -> float:
     if fit.status == Status.FAILED:
         return 0.0
     body = view.to_canonical(fit.superquadric)
-    parameters = np.concatenate([body.size, body.shape, body.translation])
+    parameters = np.concatenate([body.size, body.shape, body.translation, body.taper])
     agreement = soft_agreement.agreement(
         view.image, _SCORE_STRIDE, parameters, body.rotation_matrix, options.sharpness, options.tau
     )

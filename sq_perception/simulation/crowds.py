@@ -67,7 +67,7 @@ class _Placed:
         return cls(body, body.sample_surface(_SURFACE_SAMPLES, rng, oversampling=2))
 
     def moved(self, by: np.ndarray) -> _Placed:
-        body = Superquadric(self.body.size, self.body.shape, self.body.translation + by, self.body.rotation)
+        body = Superquadric(self.body.size, self.body.shape, self.body.translation + by, self.body.rotation, self.body.taper)
         return _Placed(body, self.surface + by)
 
     def overlaps(self, other: _Placed) -> bool:

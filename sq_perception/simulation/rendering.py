@@ -107,8 +107,8 @@ def _hollow_out(
                 origin, way = in_object_frame(m, -t1, -t2, -t3), in_object_frame(m, x, y, 1.0)
                 (ox, oy, oz), (dx, dy, dz) = origin, way
                 z = depth[v, u]
-                if gauge(ox + z * dx, oy + z * dy, oz + z * dz, a1, a2, a3, e1, e2) < 1.0:
-                    hit, _, last = ray_interval(origin, way, (a1, a2, a3, e1, e2))
+                if gauge(ox + z * dx, oy + z * dy, oz + z * dz, a1, a2, a3, e1, e2, 0.0, 0.0) < 1.0:
+                    hit, _, last = ray_interval(origin, way, (a1, a2, a3, e1, e2, 0.0, 0.0))
                     if hit and last > z:
                         depth[v, u] = last
 

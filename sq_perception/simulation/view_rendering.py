@@ -226,10 +226,10 @@ def _cast(
                 turn[0, 1] * x + turn[1, 1] * y,
                 turn[0, 2] * x + turn[1, 2] * y,
             )
-            hit, t = ray_entry((ox, oy, oz), (-turn[2, 0], -turn[2, 1], -turn[2, 2]), (a1, a2, a3, e1, e2))
+            hit, t = ray_entry((ox, oy, oz), (-turn[2, 0], -turn[2, 1], -turn[2, 2]), (a1, a2, a3, e1, e2, 0.0, 0.0))
             if hit and is_pinhole:
                 px, py, pz = ox - t * turn[2, 0], oy - t * turn[2, 1], oz - t * turn[2, 2]
-                _, nx, ny, nz, _, _ = gauge_derivatives(px, py, pz, a1, a2, a3, e1, e2)
+                _, nx, ny, nz, _, _, _, _ = gauge_derivatives(px, py, pz, a1, a2, a3, e1, e2, 0.0, 0.0)
                 hit = nx * (eye_1 - px) + ny * (eye_2 - py) + nz * (eye_3 - pz) > 0.0
             if hit:
                 surface[i, j] = (np.floor((t3 - t) / quantum) + 0.5) * quantum if quantum > 0.0 else t3 - t

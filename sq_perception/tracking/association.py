@@ -152,6 +152,8 @@ def _extent(state: np.ndarray, x: float, y: float, z: float) -> float:
             state[2],
             state[3],
             state[4],
+            0.0,
+            0.0,
         )
     )
 

@@ -178,6 +178,7 @@ class TrackingSession:
                 body, covariance = _in_form_of(body, covariance, observation)
             elif not np.isfinite(observation.covariance).all():
                 covariance = np.full((LENGTH, LENGTH), np.nan)
+            body = _tapered_like(body, observation.superquadric)
             found.append(Followed(track.id, track.seen, is_fused, body, covariance))
         return tuple(found)
 
@@ -189,12 +190,20 @@ class TrackingSession:
         return self._tracker
 
 
+def _tapered_like(body: Superquadric, observed: Superquadric) -> Superquadric:
+    """An untapered body in the box of the observed one, with its taper where both have the same z axis."""
+    turn = np.round(body.rotation_matrix.T @ observed.rotation_matrix)
+    if not observed.is_tapered or abs(turn[2, 2]) != 1:
+        return body
+    return body.with_taper(turn[2, 2] * np.abs(turn[:2, :2]) @ observed.taper)
+
+
 def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.ndarray:
     """Which observations (n,) have points that span more, along their axes, than their track's body in this frame."""
     if not bodies:
         return np.zeros(0, bool)
     shown = Superquadric.stack([each.superquadric for each in observed])
-    spanned = shown.size * np.stack([each.seen for each in observed])
+    spanned = shown.untapered().size * np.stack([each.seen for each in observed])
     wide = Superquadric.stack(bodies).support(np.swapaxes(shown.rotation_matrix, -1, -2))
     return np.asarray((spanned > _SPANNED * wide).any(axis=-1))
 
@@ -209,7 +218,7 @@ def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observe
     found, changed = forms.named(
         body.to_flat(),
         covariance,
-        observation.superquadric.to_flat(),
+        observation.superquadric.untapered().to_flat(),
         own if known else np.zeros((LENGTH, LENGTH)),
     )
     return Superquadric.from_flat(found), changed if known else own

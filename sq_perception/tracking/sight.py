@@ -96,7 +96,7 @@ def _near_side(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.nda
 def _surface(bodies: Superquadric) -> np.ndarray:
     """Points (n, 26, 3) of the surfaces of bodies (n,)."""
     along = _DIRECTIONS * bodies.size[:, None]
-    local = Superquadric.at_origin(bodies.size, bodies.shape)
+    local = Superquadric.at_origin(bodies.size, bodies.shape, bodies.taper)
     return np.asarray(bodies.to_parent(along / local.gauge(along)[..., None]))
 
 

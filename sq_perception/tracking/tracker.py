@@ -183,7 +183,7 @@ def _in_world(
             raise ValueError("recoveries: expected a single body in each")
         if np.shape(body.covariance) != (LENGTH, LENGTH):
             raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(body.covariance)}")
-    flat = np.array([body.superquadric.to_flat() for body in recoveries], dtype=float)
+    flat = np.array([body.superquadric.untapered().to_flat() for body in recoveries], dtype=float)
     covariance = np.array([body.covariance for body in recoveries], dtype=float)
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     if unknown.any():

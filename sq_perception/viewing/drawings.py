@@ -167,7 +167,7 @@ def mesh_vertices(body: Superquadric) -> np.ndarray:
     eta = np.linspace(-np.pi / 2, np.pi / 2, ROWS + 1)[1:-1]
     omega = np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False)
     grid = np.meshgrid(eta, omega, indexing="ij")
-    rows = Superquadric.at_origin(body.size, body.shape).parametric_points(grid[0].ravel(), grid[1].ravel())
+    rows = Superquadric.at_origin(body.size, body.shape, body.taper).parametric_points(grid[0].ravel(), grid[1].ravel())
     top = np.array([[0.0, 0.0, body.size[2]]])
     return np.concatenate([-top, rows, top]).astype(np.float32)
 
@@ -178,7 +178,7 @@ def shell(body: Superquadric, sigma_size: np.ndarray) -> Superquadric | None:
     if not (sigma > 0).any():
         return None
     size = np.minimum(body.size + SHELL_SIGMAS * sigma, LARGEST_SHELL * body.size)
-    return Superquadric(size, body.shape, body.translation, body.rotation)
+    return Superquadric(size, body.shape, body.translation, body.rotation, body.taper)
 
 
 def label_position(body: Superquadric) -> np.ndarray:
