@@ -1,7 +1,7 @@
 """Several superquadrics to the points or the mesh of one object: its parts.
 
-Bodies share the points as in :mod:`sq_perception.fitting.point_cost`: each point belongs to the nearest surface, softly,
-or to none.  Where the points close a volume, a grid tells what is outside of the object and what is inside: probes on
+Bodies share the points as in :mod:`sq_perception.fitting.point_cost`: each point belongs to the nearest surface,
+softly, or to none.  Where the points close a volume, a grid tells what is outside of the object and what is inside: probes on
 either side, evenly in space, keep bodies out of the one and have them fill the other.
 
 The number of bodies is that of the shortest description (A. Leonardis, A. Jaklic, F. Solina, Superquadrics for
@@ -27,7 +27,7 @@ import numpy as np
 
 from sq_perception.fitting import point_cost, points
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.point_cloud import UnitCloud, finite_points
+from sq_perception.fitting.point_cloud import UnitCloud
 from sq_perception.fitting.point_cost import Cloud, Course, Mixture, Prior
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -120,7 +120,7 @@ def decompose(
     if reason:
         alone = points.unfit(cloud, reason, began)
         return Parts((alone,), np.zeros(1), alone.status, reason, math.nan, alone.milliseconds)
-    search = _Search(cloud, _with_probes(cloud, given), points.prior_of(cloud, taper=False), sigma)
+    search = _Search(cloud, _with_probes(cloud, given), points.prior_of(cloud, True), sigma)
     mixture = search.pruned(search.grown(most))
     return _assessed(cloud, mixture, began)
 
@@ -134,7 +134,7 @@ class _Search:
 
     def grown(self, most: int) -> Mixture:
         """The union of the shortest description; growing ends when two more bodies in a row do not shorten it."""
-        start = points.searched(self._cloud, None, "auto")
+        start = points.searched(self._cloud, None, "auto", True)
         best = current = self._settled(start._replace(share=min(start.share, 0.3)), _THOROUGH)
         misses = 0
         while len(current.bodies) < most and misses < 2:
@@ -179,6 +179,7 @@ class _Search:
             for axis in range(3):
                 halves = np.repeat(bodies[k][None], 2, axis=0)
                 halves[:, axis] *= 0.5
+                halves[:, 8:] = 0.0
                 step = turns[k][:, axis] * halves[0, axis]
                 halves[0, 5:8] -= step
                 halves[1, 5:8] += step

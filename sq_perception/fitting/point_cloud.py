@@ -111,6 +111,7 @@ class UnitCloud:
             numbers[3:5],
             self.centre + self.scale * (self.axes @ numbers[5:8]),
             quaternions.from_matrix(self.axes @ turn),
+            numbers[8:10],
         )
 
 

@@ -1,6 +1,6 @@
 """Superquadrics and points: a mixture of surfaces and background, and the step that lowers its cost; compiled.
 
-Model.  A point p comes with probability 1 - w from the surface of a body, spread evenly over its area A and displaced by
+Model.  A point p comes with probability 1 - w from the surface of a body, spread evenly over its area A, displaced by
 normal noise of standard deviation s, or with probability w from anywhere in the volume V of the cloud's box:
 
     P(p) = (1 - w) / A  N(d(p); 0, s^2)  +  w / V,        d = (g - 1) / |grad g|
@@ -12,8 +12,7 @@ are nearest to it, softly.
 
 A probe is a point known to lie outside, or inside, of the object: d is then held at 0 or above, or at 0 or below.
 
-A body is a vector (10,): a1 a2 a3 e1 e2 t1 t2 t3 k1 k2 and a rotation (3, 3), object to parent, with the tapers
-x' = x / (1 + k1 z/a3), y' = y / (1 + k2 z/a3).  A step has 13 entries: log sizes, exponents, centre, rotation vector in
+A body is a vector (10,): a1 a2 a3 e1 e2 t1 t2 t3 k1 k2 and a rotation (3, 3), object to parent.  A step has 13 entries: log sizes, exponents, centre, rotation vector in
 the object frame, tapers.  Lengths are in units of the cloud, about 1.
 """
 
@@ -32,12 +31,8 @@ BODY_LENGTH = 10
 _LANES = 64
 _TINY = 1e-12
 """Added to a squared gradient to keep divisions by it finite."""
-_FARTHEST = 1.2
-"""|z / a3| beyond which tapered sections no longer change."""
-_LEAST_WIDTH = 0.05
-"""Least 1 + k z / a3: beyond the tip of a tapered body its sections stay as wide as here."""
-_LONGEST = np.array([0.5, 0.5, 0.5, 0.3, 0.3, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5, 0.3, 0.3])
-"""Largest entries of one step, beyond which distances are no longer linear; the centre's in largest half sizes."""
+_LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
+"""Largest changes in one step, those of exponents and tapers alike; a shift is limited to the largest half size."""
 _ATTEMPTS = 5
 """Refused steps in a row, damping growing 10^4 fold, before the search ends."""
 
@@ -64,11 +59,7 @@ def _numbers(body: np.ndarray) -> Body:
 def _first_order(x: float, y: float, z: float, body: Body) -> tuple[float, float, float, float]:
     """Sampson distance of a point of the object's frame, and the unit gradient of the gauge."""
     a1, a2, a3, e1, e2, _, _, _, k1, k2 = body
-    w = min(max(z / a3, -_FARTHEST), _FARTHEST)
-    f1, f2 = max(1.0 + k1 * w, _LEAST_WIDTH), max(1.0 + k2 * w, _LEAST_WIDTH)
-    g, gx, gy, gz, _, _ = gauge_derivatives(x / f1, y / f2, z, a1, a2, a3, e1, e2)
-    gx, gy = gx / f1, gy / f2
-    gz -= (gx * x / f1 * k1 + gy * y / f2 * k2) / a3
+    g, gx, gy, gz, _, _, _, _ = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, k1, k2)
     scale = 1.0 / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
     return (g - 1.0) * scale, gx * scale, gy * scale, gz * scale
 
@@ -117,22 +108,15 @@ def _rows(points: np.ndarray, first: int, body: np.ndarray, m: np.ndarray, rows:
         rows[13, i] = d
     for i in range(_LANES):
         x, y, z = rows[0, i], rows[1, i], rows[2, i]
-        w = min(max(z / a3, -_FARTHEST), _FARTHEST)
-        f1, f2 = max(1.0 + k1 * w, _LEAST_WIDTH), max(1.0 + k2 * w, _LEAST_WIDTH)
-        u, v = x / f1, y / f2
-        g, gu, gv, gz, g_e1, g_e2 = gauge_derivatives(u, v, z, a1, a2, a3, e1, e2)
-        of_k1, of_k2 = -gu * u / f1, -gv * v / f2
-        gx, gy = gu / f1, gv / f2
-        gz += (of_k1 * k1 + of_k2 * k2) / a3
+        _, gx, gy, gz, g_e1, g_e2, g_k1, g_k2 = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, k1, k2)
         scale = 1.0 / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
         gx, gy, gz = gx * scale, gy * scale, gz * scale
-        rows[0, i], rows[1, i], rows[2, i] = -u * gu * scale, -v * gv * scale, -z * gz
-        rows[3, i], rows[4, i] = g_e1 * scale, g_e2 * scale
+        rows[0, i], rows[1, i], rows[2, i] = -x * gx, -y * gy, -z * gz
+        rows[3, i], rows[4, i], rows[11, i], rows[12, i] = g_e1 * scale, g_e2 * scale, g_k1 * scale, g_k2 * scale
         rows[5, i] = -(m11 * gx + m12 * gy + m13 * gz)
         rows[6, i] = -(m21 * gx + m22 * gy + m23 * gz)
         rows[7, i] = -(m31 * gx + m32 * gy + m33 * gz)
         rows[8, i], rows[9, i], rows[10, i] = gy * z - gz * y, gz * x - gx * z, gx * y - gy * x
-        rows[11, i], rows[12, i] = of_k1 * w * scale, of_k2 * w * scale
     return count
 
 
@@ -224,17 +208,17 @@ def _moved(body: np.ndarray, m: np.ndarray, step: np.ndarray, prior: Prior) -> t
     size = max(body[0], body[1], body[2])
     new, turned = body.copy(), m.copy()
     for k in range(8):
-        most = _LONGEST[k] * (size if k >= 5 else 1.0)
+        most = _LONGEST_LOG_SIZE if k < 3 else (_LONGEST_SHAPE if k < 5 else size)
         change = min(max(step[k], -most), most)
         new[k] = body[k] * math.exp(change) if k < 3 else body[k] + change
     for k in range(2):
-        new[8 + k] = body[8 + k] + min(max(step[11 + k], -_LONGEST[11]), _LONGEST[11])
+        new[8 + k] = body[8 + k] + min(max(step[11 + k], -_LONGEST_SHAPE), _LONGEST_SHAPE)
     for k in range(BODY_LENGTH):
         new[k] = min(max(new[k], prior.lower[k]), prior.upper[k])
     x, y, z = step[8], step[9], step[10]
     angle = math.sqrt(x * x + y * y + z * z)
     if angle > 1e-12:
-        turn = min(angle, _LONGEST[8])
+        turn = min(angle, _LONGEST_TURN)
         x, y, z = x / angle, y / angle, z / angle
         s, c = math.sin(turn), 1.0 - math.cos(turn)
         for i in range(3):  # R exp([w]) by Rodrigues, row by row

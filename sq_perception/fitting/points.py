@@ -35,8 +35,10 @@ from sq_perception.geometry.support_directions import DIRECTIONS
 
 MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
-_STAGES = ((400, 4, 24), (800, 8, 4), (MOST_POINTS, 40, 2))
+_STAGES = ((400, 4, 24), (800, 8, 4))
 """Points, rounds and most bodies of each stage of the search."""
+_LAST_ROUNDS = 40
+"""Most rounds with all points; mostly six do."""
 _DENSE = 0.3
 """Share of the points that are the densest: of a cloud with 60 % of outliers seven in eight of these are none."""
 _EIGHTH_TURNS = np.stack(
@@ -101,7 +103,7 @@ def fit_points(
     reason = why_unfit(cloud)
     if reason:
         return unfit(cloud, reason, began)
-    found = searched(cloud, None if sigma is None else sigma / cloud.scale, outliers)
+    found = searched(cloud, None if sigma is None else sigma / cloud.scale, outliers, taper)
     return assessed(cloud, found, 0, began)
 
 
@@ -156,23 +158,38 @@ def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarra
     return kept, normals[there]
 
 
-def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str) -> Mixture:
-    """The likeliest body of a cloud."""
-    prior = prior_of(cloud, False)
+def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper: bool) -> Mixture:
+    """The likeliest body of a cloud, tapered if it is likelier so than two more numbers cost."""
     share = _SHARE if outliers == "auto" else float(outliers)
-    found = [
-        Mixture(body[None], turn[None], max(_SIGMA, sigma or 0.0), share, -math.inf) for body, turn in _starts(cloud)
-    ]
+    found = [Mixture(body[None], turn[None], _SIGMA, share, -math.inf) for body, turn in _starts(cloud)]
+    straight, tapered = prior_of(cloud, False), prior_of(cloud, True)
     for number, rounds, most in _STAGES:
-        is_last = number == MOST_POINTS
-        given = sigma is not None and is_last
-        course = Course(given, outliers != "auto", 1e-4, rounds, 1e-5 if is_last else 1e-3, is_last)
         some = cloud.surface(cloud.every(number))
-        if given:
-            found = [each._replace(sigma=sigma) for each in found]
-        found = [point_cost.settle(some, each, prior, course) for each in found[:most]]
+        course = Course(False, outliers != "auto", 1e-4, rounds, 1e-3, False)
+        found = [point_cost.settle(some, each, straight, course) for each in found[:most]]
         found.sort(key=lambda each: -each.likelihood)
-    return found[0]
+    candidates = [(found[0], straight)]
+    if taper:
+        turned = [point_cost.settle(some, each, tapered, course) for each in _in_all_orders(found[0])]
+        best = max(turned, key=lambda each: each.likelihood)
+        if best.likelihood > found[0].likelihood + math.log(len(some.points)):
+            candidates.append((best, tapered))
+    whole = cloud.surface(cloud.points)
+    course = Course(sigma is not None, outliers != "auto", 1e-4, _LAST_ROUNDS, 1e-5, True)
+    if sigma is not None:
+        candidates = [(each._replace(sigma=sigma), prior) for each, prior in candidates]
+    ends = [point_cost.settle(whole, each, prior, course) for each, prior in candidates]
+    return ends[-1] if ends[-1].likelihood > ends[0].likelihood + math.log(len(whole.points)) else ends[0]
+
+
+def _in_all_orders(mixture: Mixture) -> list[Mixture]:
+    """The single body of a mixture with each of its axes as z: the one along which it may be tapered."""
+    body, turn = mixture.bodies[0], mixture.turns[0]
+    found = [mixture]
+    for order in ORDERS[:2]:
+        other = np.array([*body[:3][order], *[body[3:5].mean()] * 2, *body[5:8], 0.0, 0.0])
+        found.append(mixture._replace(bodies=other[None], turns=np.ascontiguousarray(turn[:, order])[None]))
+    return found
 
 
 def _starts(cloud: UnitCloud) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -252,7 +269,7 @@ def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) 
     alike = max(1.0, float(together[number >= 1].mean()) if (number >= 1).any() else 1.0)
     lower = np.tril(sums[:STEP_LENGTH, :STEP_LENGTH])
     information = (lower + np.tril(lower, -1).T) / alike + np.diag(_PRIOR)
-    if mixture.bodies.shape[1] == BODY_LENGTH and not body[8:].any():
+    if not body[8:].any():  # straight, not by measurement but by choice
         information[11:, :11] = information[:11, 11:] = 0.0
     units = np.concatenate([body[0:3], np.ones(STEP_LENGTH - 3)])
     covariance = units[:, None] * np.linalg.inv(information) * units
