@@ -29,6 +29,7 @@ from sq_perception.fitting import point_cost, points
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.point_cloud import UnitCloud
 from sq_perception.fitting.point_cost import Cloud, Course, Mixture, Prior
+from sq_perception.geometry.signed_distance import signed_distance
 from sq_perception.geometry.superquadric import Superquadric
 
 MOST_PARTS = 6
@@ -87,6 +88,12 @@ class Parts:
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Whether points (n, 3) are in one of the parts, (n,)."""
         return np.asarray((self.superquadrics.gauge(np.asarray(points, dtype=float)[None]) <= 1).any(axis=0))
+
+    def signed_distance(self, points: np.ndarray, k_sigma: float = 0.0, *, gradient: bool = False) -> Any:
+        """As :meth:`Fit.signed_distance`, of the nearest part."""
+        covariances = np.stack([fit.covariance for fit in self.fits])
+        found = signed_distance(self.superquadrics, points, covariances, k_sigma)
+        return found if gradient else found[0]
 
 
 def decompose(
@@ -225,7 +232,7 @@ def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
     """The points of a cloud with probes outside and inside, where the points given (n, 3) close a volume."""
     from scipy import ndimage  # here: a node that recovers does without
 
-    surface = cloud.surface(cloud.every(_POINTS))
+    surface = cloud.surface(_POINTS)
     dense = (given - cloud.centre) @ cloud.axes / cloud.scale
     low, high = dense.min(axis=0), dense.max(axis=0)
     side = float((high - low).max()) / _GRID
@@ -247,11 +254,14 @@ def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
         probes.append((at - 2) * side + low)
         sides.append(np.full(len(at), sign))
     weight = 0.5 / (2 * _RESOLUTION) ** 2
-    return surface._replace(probes=np.concatenate(probes), sides=np.concatenate(sides), probe_weight=weight)
+    owners = np.full(sum(len(each) for each in sides), -1)
+    return surface._replace(
+        probes=np.concatenate(probes), sides=np.concatenate(sides), owners=owners, probe_weight=weight
+    )
 
 
 def _assessed(cloud: UnitCloud, mixture: Mixture, began: float) -> Parts:
-    surface = cloud.surface(cloud.points)
+    surface = cloud.surface()
     none = np.zeros((len(cloud.points), len(mixture.bodies)))
     shares = point_cost.shares(surface, mixture, none)[0].mean(axis=0)
     order = np.argsort(-shares, kind="stable")

@@ -18,6 +18,9 @@ from sq_perception.geometry.superquadric import Superquadric
 
 _NEIGHBOURS = 9
 """Points in a neighbourhood, its middle included, that tell how dense a cloud is there."""
+_PROBE_STEP, _PROBE_WEIGHT = 0.05, 100.0
+"""How far along the normals probes lie, in radii of the cloud, and the weight of their squared distance: a quarter of
+what a point weighs whose noise is as large."""
 _BITS = 10
 """Cells of Morton's curve along an axis, as a power of 2."""
 
@@ -75,12 +78,11 @@ class UnitCloud:
         order = np.argsort(_morton(centred), kind="stable")
         if len(order) > most:
             order = order[np.linspace(0, len(order) - 1, most).astype(int)]
-        turned = None if normals is None else np.ascontiguousarray((normals @ axes)[order])
+        turned = None
+        if normals is not None:
+            length = np.linalg.norm(normals[order], axis=1, keepdims=True)
+            turned = normals[order] @ axes / np.where(length > 0, length, 1.0)
         return cls(np.ascontiguousarray(centred[order]), turned, centre, axes, scale)
-
-    def every(self, count: int) -> np.ndarray:
-        """About ``count`` points (n, 3), evenly in space."""
-        return np.ascontiguousarray(self.points[:: max(1, round(len(self.points) / count))])
 
     def densest(self, share: float) -> np.ndarray:
         """The points (n, 3) with the nearest neighbours, this share of all."""
@@ -100,9 +102,17 @@ class UnitCloud:
         sides = np.ptp(self.points, axis=0)
         return 1 / float(np.prod(np.maximum(sides, 0.01 * max(float(sides.max()), 1e-9))))
 
-    def surface(self, points: np.ndarray) -> Cloud:
-        """Points of surfaces, without probes."""
-        return Cloud(points, np.empty((0, 3)), np.empty(0), self.background, 0.0)
+    def surface(self, count: int | None = None) -> Cloud:
+        """About ``count`` points, or all of them; normals give each a probe on either side."""
+        step = 1 if count is None else max(1, round(len(self.points) / count))
+        points = np.ascontiguousarray(self.points[::step])
+        if self.normals is None:
+            return Cloud(points, np.empty((0, 3)), np.empty(0), np.empty(0, np.int64), self.background, 0.0)
+        step_out = _PROBE_STEP * self.normals[::step]
+        owners = np.tile(np.arange(len(points)), 2)
+        sides = np.repeat([1.0, -1.0], len(points))
+        probes = np.concatenate([points + step_out, points - step_out])
+        return Cloud(points, probes, sides, owners, self.background, _PROBE_WEIGHT)
 
     def body(self, numbers: np.ndarray, turn: np.ndarray) -> Superquadric:
         """A body (10,) with its rotation (3, 3) in the frame of the user."""

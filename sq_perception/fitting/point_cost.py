@@ -294,12 +294,14 @@ class Cloud(NamedTuple):
     """What bodies are fitted to, in units of the cloud.
 
     ``points`` (n, 3) lie on surfaces, or anywhere; ``probes`` (m, 3) are known to be outside (``sides`` 1) or inside
-    (-1).  ``background`` is 1 / V, ``probe_weight`` the weight of a squared distance of a probe on the wrong side.
+    (-1), as far as the point that each is derived from, of index ``owners`` (-1 for none), is of a surface.
+    ``background`` is 1 / V, ``probe_weight`` the weight of a squared distance of a probe on the wrong side.
     """
 
     points: np.ndarray
     probes: np.ndarray
     sides: np.ndarray
+    owners: np.ndarray
     background: float
     probe_weight: float
 
@@ -392,7 +394,8 @@ def settle(cloud: Cloud, start: Mixture, prior: Prior, course: Course) -> Mixtur
             of_probe[:, k] = distances(cloud.probes, bodies[k], turns[k])
         for i in range(m):
             nearest = of_probe[i].min()
-            total -= 0.5 * cloud.probe_weight * min(cloud.sides[i] * nearest, 0.0) ** 2
+            holds = 1.0 if cloud.owners[i] < 0 else probability[cloud.owners[i]].sum()
+            total -= 0.5 * holds * cloud.probe_weight * min(cloud.sides[i] * nearest, 0.0) ** 2
         gain = total - likelihood
         likelihood = total
         if turn == course.rounds or (turn > 2 and abs(gain) < course.tolerance * n):
@@ -408,7 +411,8 @@ def settle(cloud: Cloud, start: Mixture, prior: Prior, course: Course) -> Mixtur
                 weights[i] = probability[i, k] / (sigma * sigma)
             for i in range(m):  # what is inside belongs to the nearest body, what is outside to none
                 is_its = cloud.sides[i] > 0.0 or of_probe[i, k] <= of_probe[i].min()
-                weights[n + i] = cloud.probe_weight if is_its else 0.0
+                holds = 1.0 if cloud.owners[i] < 0 else probability[cloud.owners[i]].sum()
+                weights[n + i] = holds * cloud.probe_weight if is_its else 0.0
             bodies[k], turns[k], _ = improve(
                 together, offsets[:, k].copy(), sides, weights, bodies[k], turns[k], prior, 2, 1e-6
             )

@@ -55,6 +55,8 @@ _OF_MESH = 20000
 FLAT = 1e-6
 """Spread across a plane, as a share of that along it, below which points lie on it."""
 _MANY_OUTLIERS = 0.3
+_POINTS_A_DIRECTION = 3
+"""Points a direction, of all sides: of fewer, some directions have none by chance."""
 _ONE_SIDED = 0.75
 """Share of 42 directions from the centre in which there must be points of an object that is seen from all sides."""
 
@@ -105,6 +107,12 @@ def fit_points(
         return unfit(cloud, reason, began)
     found = searched(cloud, None if sigma is None else sigma / cloud.scale, outliers, taper)
     return assessed(cloud, found, 0, began)
+
+
+def fit_mesh(mesh: Any, *, taper: bool = True) -> Fit:
+    """Fit one superquadric to a closed mesh, what has ``vertices`` and ``faces``: as :func:`fit_points` to its points."""
+    drawn, normals = surface_of(mesh)
+    return fit_points(drawn, normals, taper=taper)
 
 
 def why_unfit(cloud: UnitCloud) -> str:
@@ -164,7 +172,7 @@ def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper
     found = [Mixture(body[None], turn[None], _SIGMA, share, -math.inf) for body, turn in _starts(cloud)]
     straight, tapered = prior_of(cloud, False), prior_of(cloud, True)
     for number, rounds, most in _STAGES:
-        some = cloud.surface(cloud.every(number))
+        some = cloud.surface(number)
         course = Course(False, outliers != "auto", 1e-4, rounds, 1e-3, False)
         found = [point_cost.settle(some, each, straight, course) for each in found[:most]]
         found.sort(key=lambda each: -each.likelihood)
@@ -174,7 +182,7 @@ def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper
         best = max(turned, key=lambda each: each.likelihood)
         if best.likelihood > found[0].likelihood + math.log(len(some.points)):
             candidates.append((best, tapered))
-    whole = cloud.surface(cloud.points)
+    whole = cloud.surface()
     course = Course(sigma is not None, outliers != "auto", 1e-4, _LAST_ROUNDS, 1e-5, True)
     if sigma is not None:
         candidates = [(each._replace(sigma=sigma), prior) for each, prior in candidates]
@@ -212,7 +220,7 @@ def _starts(cloud: UnitCloud) -> list[tuple[np.ndarray, np.ndarray]]:
 
 def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: tuple[str, ...] = ()) -> Fit:
     """The result of the k-th body of a mixture."""
-    surface = cloud.surface(cloud.points)
+    surface = cloud.surface()
     probability, distance, _ = point_cost.shares(surface, mixture, np.zeros((len(cloud.points), len(mixture.bodies))))
     weight, off = probability[:, k], distance[:, k]
     body, turn = mixture.bodies[k], mixture.turns[k]
@@ -230,6 +238,8 @@ def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: 
     typical = float(np.median(np.abs(off[inlying]))) * cloud.scale if inlying.any() else math.inf
     status, message = assess(canonical, covariance, typical, sigma, False)
     notes = list(reasons)
+    if len(mixture.bodies) == 1 and _covered(cloud.points[inlying], body, turn) < _ONE_SIDED:
+        notes.append("seen from one side only: sq-perception recover knows more, with the camera that took the points")
     if len(mixture.bodies) == 1 and mixture.share > _MANY_OUTLIERS:
         notes.append(f"{mixture.share:.0%} of the points are on no surface of it: outliers, or parts of more bodies")
     if float(canonical.size.min()) < 2 * sigma:
@@ -252,6 +262,17 @@ def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: 
     )
 
 
+def _covered(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> float:
+    """Share of the 42 directions from a body's centre in which there is one of some points (n, 3)."""
+    cells = _directions(some, body, turn)
+    return len(np.unique(cells)) / min(len(DIRECTIONS), max(1, len(cells) // _POINTS_A_DIRECTION))
+
+
+def _directions(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """In which of the 42 directions (n,) points lie from a body's centre, in units of its half sizes."""
+    return np.argmax(((some - body[5:8]) @ turn) / body[0:3] @ DIRECTIONS.T, axis=1)
+
+
 def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) -> np.ndarray:
     """Covariance (13, 13) of sizes, exponents, centre, rotation vector and tapers, in units of the cloud."""
     body, turn = mixture.bodies[k], mixture.turns[k]
@@ -262,8 +283,7 @@ def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) 
     point_cost.normal_equations(
         surface.points, np.zeros(len(weight)), np.zeros(len(weight)), scaled, body, turn, none, sums
     )
-    direction = ((surface.points - body[5:8]) @ turn) / body[0:3]
-    cell = np.argmax(direction @ DIRECTIONS.T, axis=1)
+    cell = _directions(surface.points, body, turn)
     number = np.bincount(cell, weight, len(DIRECTIONS))
     together = np.bincount(cell, weight * residual, len(DIRECTIONS)) ** 2 / np.maximum(number, 1.0)
     alike = max(1.0, float(together[number >= 1].mean()) if (number >= 1).any() else 1.0)
