@@ -1,8 +1,8 @@
 """Several superquadrics to the points or the mesh of one object: its parts.
 
 Bodies share the points as in :mod:`sq_perception.fitting.point_cost`: each point belongs to the nearest surface,
-softly, or to none.  Where the points close a volume, a grid tells what is outside of the object and what is inside: probes on
-either side, evenly in space, keep bodies out of the one and have them fill the other.
+softly, or to none.  Where the points close a volume, a grid tells what is outside of the object and what is inside:
+probes on either side, evenly in space, keep bodies out of the one and have them fill the other.
 
 The number of bodies is that of the shortest description (A. Leonardis, A. Jaklic, F. Solina, Superquadrics for
 Segmenting and Modeling Range Data, IEEE PAMI 19(11), 1997).  In nats, for k bodies with the log-likelihood L of n

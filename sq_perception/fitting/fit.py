@@ -80,7 +80,7 @@ class Fit:
         return np.sqrt(np.diag(self.covariance)[:3])
 
     def signed_distance(self, points: np.ndarray, k_sigma: float = 0.0, *, gradient: bool = False) -> Any:
-        """A lower bound of the signed distance of points (n, 3) to the body, less ``k_sigma`` standard deviations of it.
+        """A lower bound of the signed distance of points (n, 3) to the body, less so many standard deviations of it.
 
         Shape (n,), metres, negative inside, and with ``gradient`` its gradient (n, 3) too, see
         :mod:`sq_perception.geometry.signed_distance`.  Raises ValueError for deviations of a body without any.

@@ -12,8 +12,9 @@ are nearest to it, softly.
 
 A probe is a point known to lie outside, or inside, of the object: d is then held at 0 or above, or at 0 or below.
 
-A body is a vector (10,): a1 a2 a3 e1 e2 t1 t2 t3 k1 k2 and a rotation (3, 3), object to parent.  A step has 13 entries: log sizes, exponents, centre, rotation vector in
-the object frame, tapers.  Lengths are in units of the cloud, about 1.
+A body is a vector (10,): a1 a2 a3 e1 e2 t1 t2 t3 k1 k2, and a rotation (3, 3), object to parent.  A step has 13
+entries: log sizes, exponents, centre, rotation vector in the object frame, tapers.  Lengths are in units of the cloud,
+about 1.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ import numpy as np
 
 from sq_perception.fitting import point_cost
 from sq_perception.fitting.covariance import carried_over
-from sq_perception.fitting.fit import INLIER, Fit, Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import EXPONENTS, LARGEST_SIZE, MIN_PIXELS, SMALLEST_SIZE
 from sq_perception.fitting.point_cloud import UnitCloud, finite_points
 from sq_perception.fitting.point_cost import BODY_LENGTH, STEP_LENGTH, Cloud, Course, Mixture, Prior
@@ -37,6 +37,8 @@ MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
 _STAGES = ((400, 4, 24), (800, 8, 4))
 """Points, rounds and most bodies of each stage of the search."""
+_COARSE = 0.02
+"""Least noise of the search, in radii of the cloud: a part that is a perfect superquadric is not the whole thing."""
 _LAST_ROUNDS = 40
 """Most rounds with all points; mostly six do."""
 _DENSE = 0.3
@@ -44,12 +46,12 @@ _DENSE = 0.3
 _EIGHTH_TURNS = np.stack(
     [np.eye(3), *(quaternions.to_matrix(quaternions.from_rotation_vector(np.eye(3) * math.pi / 4)))]
 )
-_SIGMA, _SHARE = 0.07, 0.5
+_SIGMA, _SHARE = 0.05, 0.5
 """Noise of a start, in radii of the cloud, and its share of outliers: a start is off by about so much."""
 _TAPER_PRECISION = 10.0
 """1 / variance of a taper before its points."""
 _PRIOR = np.array([1.0] * 3 + [0.5] * 2 + [1.0] * 3 + [1.0] * 3 + [0.5] * 2) ** -2.0
-"""Precision of the prior of a step: what points leave open has its width, see :mod:`sq_perception.fitting.covariance`."""
+"""Precision of the prior of a step: what points leave open has its width."""
 _OF_MESH = 20000
 """Points that are drawn from a mesh."""
 FLAT = 1e-6
@@ -110,7 +112,7 @@ def fit_points(
 
 
 def fit_mesh(mesh: Any, *, taper: bool = True) -> Fit:
-    """Fit one superquadric to a closed mesh, what has ``vertices`` and ``faces``: as :func:`fit_points` to its points."""
+    """Fit one superquadric to a mesh, what has ``vertices`` and ``faces``, as :func:`fit_points` to points of it."""
     drawn, normals = surface_of(mesh)
     return fit_points(drawn, normals, taper=taper)
 
@@ -173,7 +175,7 @@ def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper
     straight, tapered = prior_of(cloud, False), prior_of(cloud, True)
     for number, rounds, most in _STAGES:
         some = cloud.surface(number)
-        course = Course(False, outliers != "auto", 1e-4, rounds, 1e-3, False)
+        course = Course(False, outliers != "auto", _COARSE, rounds, 1e-3, False)
         found = [point_cost.settle(some, each, straight, course) for each in found[:most]]
         found.sort(key=lambda each: -each.likelihood)
     candidates = [(found[0], straight)]

@@ -4,13 +4,13 @@ A convex body with the support function h is where n.p <= h(n) for all unit n, s
 
     s(p) = max over unit n of  n.p - h(n)                                  (p relative to the centre)
 
-and each single n gives a lower bound, outside and inside.  With the gauge g, every point y has one whose h is known: the
-plane {x: grad g(y).x = 1} supports the body, so
+and each single n gives a lower bound, outside and inside.  With the gauge g, every point y has one whose h is known:
+the plane {x: grad g(y).x = 1} supports the body, so
 
     s(p) >= (grad g(y).p - 1) / |grad g(y)|.
 
-At y = p this is the Sampson distance; y then goes to the foot of p on the plane found, twice: the foot on the surface is
-the y of the exact distance.  The planes of the bounding box join.  The result is the largest, and its gradient the
+At y = p this is the Sampson distance; y then goes to the foot of p on the plane found, twice: the foot on the surface
+is the y of the exact distance.  The planes of the bounding box join.  The result is the largest, and its gradient the
 normal of that plane.  A tapered body is bounded by the support planes of its hull with these normals.
 
 Doubt: with the covariance C of the parameters, the distance to one plane has the variance J C J^T, J = (-dh/da, -dh/de,
@@ -96,7 +96,8 @@ def _nearest(
             _bounded(points, first, count, numbers[k], turns[k], best, normal)
             if k_sigma > 0.0:
                 for i in range(count):
-                    best[i] -= k_sigma * _deviation(normal[0, i], normal[1, i], normal[2, i], numbers[k], turns[k], doubts[k])
+                    n1, n2, n3 = normal[0, i], normal[1, i], normal[2, i]
+                    best[i] -= k_sigma * _deviation(n1, n2, n3, numbers[k], turns[k], doubts[k])
             m = turns[k]
             for i in range(count):
                 if best[i] < distance[first + i] or best[i] != best[i]:
@@ -157,9 +158,7 @@ def _bounded(
 
 
 @kernel
-def _deviation(
-    mx: float, my: float, mz: float, body: np.ndarray, turn: np.ndarray, covariance: np.ndarray
-) -> float:
+def _deviation(mx: float, my: float, mz: float, body: np.ndarray, turn: np.ndarray, covariance: np.ndarray) -> float:
     """Standard deviation of the distance to the support plane with the normal (mx, my, mz) in the object's frame."""
     a1, a2, a3 = body[0], body[1], body[2]
     _, sx, sy, sz, h_e1, h_e2, _, _ = support_derivatives(mx, my, mz, a1, a2, a3, body[3], body[4], body[12], body[13])
