@@ -11,7 +11,7 @@ the plane {x: grad g(y).x = 1} supports the body, so
 
 At y = p this is the Sampson distance; y then goes to the foot of p on the plane found, twice: the foot on the surface
 is the y of the exact distance.  The planes of the bounding box join.  The result is the largest, and its gradient the
-normal of that plane.  A tapered body is bounded by the support planes of its hull with these normals.
+normal of that plane.  A tapered body, with exponents up to 1, is bounded by the planes of its hull with these normals.
 
 Doubt: with the covariance C of the parameters, the distance to one plane has the variance J C J^T, J = (-dh/da, -dh/de,
 -n, m x dh/dm) for sizes, exponents, centre and rotation vector, m = R^T n; k of its standard deviations are taken off.

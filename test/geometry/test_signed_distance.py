@@ -43,10 +43,15 @@ def test_a_sharp_box_is_nearly_that_of_a_box() -> None:
     assert (distance >= exact - 1e-9).all()  # the box encloses the body
 
 
-@pytest.mark.parametrize("taper", [(0.0, 0.0), (0.5, -0.3)])
-@pytest.mark.parametrize("shape", [(0.1, 0.1), (0.3, 0.8), (1.0, 1.0), (0.1, 1.0), (1.5, 1.8)])
-def test_it_never_exceeds_the_distance_and_comes_near_it(shape: tuple[float, float], taper: tuple[float, float]) -> None:
-    """Of each point to 4000 of the surface: at least the true distance, outside; s(p) >= -that, inside, is no bound."""
+STRAIGHT, TAPERED = (0.0, 0.0), (0.5, -0.3)
+FORMS = [(shape, taper) for taper in (STRAIGHT, TAPERED) for shape in ((0.1, 0.1), (0.3, 0.8), (1.0, 1.0), (0.1, 1.0))]
+
+
+@pytest.mark.parametrize(("shape", "taper"), [*FORMS, ((1.5, 1.8), STRAIGHT), ((1.5, 1.8), (0.3, 0.3))])
+def test_it_never_exceeds_the_distance_and_comes_near_it(
+    shape: tuple[float, float], taper: tuple[float, float]
+) -> None:
+    """Outside, no point of the surface is nearer; the samples of it are farther than the nearest."""
     body = placed([1.0, 0.6, 0.3], list(shape), taper)
     surface = body.sample_surface(4000, np.random.default_rng(3))
     points = around(body, 400, 4)
@@ -76,13 +81,14 @@ def test_a_surface_point_has_distance_zero_and_its_normal() -> None:
 
 
 def test_the_gradient_says_how_the_distance_grows() -> None:
-    """s is the largest of planes: at least as high elsewhere as the plane that gave it here."""
+    """Of points near the surface, where the bound is tight, along the gradient and against it."""
     body = placed([1.0, 0.6, 0.3], [1.0, 1.0])
-    points = around(body, 300, 7)
+    surface = body.sample_surface(300, np.random.default_rng(7))
+    points = surface + 0.03 * body.normals(surface)
     distance, gradient = body.signed_distance(points, gradient=True)
     assert np.allclose(np.linalg.norm(gradient, axis=1), 1)
-    step = 1e-3
-    assert np.allclose(body.signed_distance(points + step * gradient) - distance, step, atol=2e-4)
+    for step in (-0.01, 0.01):
+        assert np.allclose(body.signed_distance(points + step * gradient) - distance, step, rtol=0.05)
 
 
 def test_the_centre_has_a_finite_one() -> None:
