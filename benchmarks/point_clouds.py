@@ -2,10 +2,10 @@
 
     EMS_FOLDER=... EMS_PYTHON=... SAGE_PYTHON=... python benchmarks/point_clouds.py --bodies 100 --things 6
 
-Single bodies: the thesis' protocol (half sizes 25 to 75, exponents 0.1 to 1, any rotation), 1500 points, evenly on the
-surface; noise is normal, its standard deviation a share of the longest full edge; outliers are spread evenly through the
-bounding box, half as large again, and replace points; a half cloud has the points whose normals are less than 90
-degrees from a random direction.  Score: IoU of the solids.
+Single bodies: the thesis' protocol (half sizes 25 to 75 of 256, exponents 0.1 to 1, any rotation), 1500 points, evenly
+on the surface; noise is normal, its standard deviation a share of the longest full edge; outliers are spread evenly
+through the bounding box, half as large again, and replace points; a half cloud has the points whose normals are less
+than 90 degrees from a random direction.  Score: IoU of the solids.
 
 Parts: household things of benchmarks/household_things, 3000 points, evenly on the outside of the union, cavities
 filled; score: IoU of the filled solid, by 20 000 random points of the box, a twelfth larger on each side.
@@ -13,9 +13,9 @@ filled; score: IoU of the filled solid, by 20 000 random points of the box, a tw
 Others run in Python environments of their own, which are neither part of this repository nor needed by it:
 
     EMS    git clone https://github.com/bmlklwx/EMS-superquadric_fitting; EMS_FOLDER is its Python/src; EMS_PYTHON
-           needs numpy, scipy and numba.  As published, with the outlier ratio 0.2 that its script has, and 0.6 for clouds
-           with 60 % of outliers; its viewer and ply reader, which are not called, are replaced by empty modules.
-    sage   pip install sage-superquadric, for SAGE_PYTHON: fit_superquadric of its superquadric module with its own start.
+           needs numpy, scipy and numba.  As published, with the outlier ratio 0.2 that its script has, and told 0.6 for
+           clouds with 60 % of outliers; its viewer and ply reader, not called, are replaced by empty modules.
+    sage   pip install sage-superquadric, for SAGE_PYTHON: fit_superquadric, with its own start
 
 SuperFlex and SuperDec publish networks; for whoever has their weights --write FOLDER writes the clouds and the true
 bodies (a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw) of each set.
@@ -63,10 +63,10 @@ SETS = {
     "half, noise 1 %": (0.01, 0.0, True),
 }
 """Noise, share of outliers, and whether only half is seen."""
-_STUB = (
-    "import sys, types\nfor name in ('mayavi', 'mayavi.mlab', 'plyfile'): sys.modules[name] = types.ModuleType(name)\n"
-)
 _EMS = """
+import types
+for name in ("mayavi", "mayavi.mlab", "plyfile"):
+    sys.modules[name] = types.ModuleType(name)
 sys.modules["mayavi"].mlab = None
 import numpy as np, time
 np.int = int
@@ -92,13 +92,12 @@ clouds, rows = np.load(sys.argv[1])["clouds"], []
 for cloud in clouds:
     began = time.process_time()
     try:
-        # In decimetres about its middle: its bounds are in metres, of household things.
         middle = cloud.mean(axis=0)
-        found = fit_superquadric((cloud - middle) / 1000)
+        found = fit_superquadric(cloud - middle)
         found = found[0] if isinstance(found, tuple) else found
         turn = Rotation.from_euler("zyx", [found["yaw"], found["pitch"], found["roll"]]).as_matrix()
-        size = [1000 * found[name] for name in ("a1", "a2", "a3")]
-        at = [1000 * found[name] for name in ("cx", "cy", "cz")] + middle
+        size = [found[name] for name in ("a1", "a2", "a3")]
+        at = middle + [found[name] for name in ("cx", "cy", "cz")]
         numbers = [*size, found["eps1"], found["eps2"], *at, *turn.ravel()]
     except Exception:
         numbers = [np.nan] * 17
@@ -162,8 +161,10 @@ def of_others(script: str, python: str, folder: str | None, clouds: list[np.ndar
     with tempfile.TemporaryDirectory() as name:
         given, got = Path(name, "clouds.npz"), Path(name, "bodies.npy")
         np.savez(given, clouds=np.stack(clouds), ratios=np.full(len(clouds), ratio))
-        paths = "" if folder is None else f"import sys; sys.path.insert(0, {str(Path(folder).resolve())!r})\n"
-        subprocess.run([python, "-W", "ignore", "-c", paths + script, str(given), str(got)], check=True)
+        added = "" if folder is None else f"sys.path.insert(0, {str(Path(folder).resolve())!r})\n"
+        subprocess.run(
+            [python, "-W", "ignore", "-c", "import sys\n" + added + script, str(given), str(got)], check=True
+        )
         rows = np.load(got)
     answers: list[Answer] = []
     for row in rows:
@@ -191,7 +192,7 @@ def singles(options: argparse.Namespace) -> dict[str, dict[str, Any]]:
         answers = {who: [fit(cloud) for cloud in clouds] for who, fit in ours.items()}
         if "EMS_PYTHON" in os.environ:
             ratio = 0.6 if case[1] > 0.5 else 0.2
-            answers["EMS"] = of_others(_STUB + _EMS, os.environ["EMS_PYTHON"], os.environ["EMS_FOLDER"], clouds, ratio)
+            answers["EMS"] = of_others(_EMS, os.environ["EMS_PYTHON"], os.environ["EMS_FOLDER"], clouds, ratio)
         if "SAGE_PYTHON" in os.environ:
             answers["sage"] = of_others(_SAGE, os.environ["SAGE_PYTHON"], None, clouds, 0.0)
         for who, found in answers.items():
