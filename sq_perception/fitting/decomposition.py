@@ -19,7 +19,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -130,6 +131,12 @@ def decompose(
     search = _Search(cloud, _with_probes(cloud, given), points.prior_of(cloud, True), sigma)
     mixture = search.pruned(search.grown(most))
     return _assessed(cloud, mixture, began)
+
+
+def decompose_all(things: Sequence[Any], *, most: int = MOST_PARTS, jobs: int | None = None) -> list[Parts]:
+    """:func:`decompose` of many objects, ``jobs`` at a time (as many as there are cores if not given)."""
+    with ThreadPoolExecutor(jobs) as executor:  # kernels let other threads of Python compute
+        return list(executor.map(lambda thing: decompose(thing, most=most), things))
 
 
 class _Search:

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 import sq_perception as sq
+from sq_perception.fitting.decomposition import decompose_all
 
 
 def body(size: list[float], shape: list[float], at: list[float]) -> sq.Superquadric:
@@ -62,6 +63,12 @@ def test_most_bounds_the_number_and_the_same_comes_again() -> None:
     assert first.superquadrics.to_numbers().tolist() == again.superquadrics.to_numbers().tolist()
     with pytest.raises(ValueError, match="most"):
         sq.decompose(points, most=0)
+
+
+def test_many_objects_are_as_each_alone() -> None:
+    clouds = [surface(HAMMER, 1500, 6), surface(HAMMER[:1], 1500, 7)]
+    for together, cloud in zip(decompose_all(clouds, jobs=2), clouds, strict=True):
+        assert together.superquadrics.to_numbers().tolist() == sq.decompose(cloud).superquadrics.to_numbers().tolist()
 
 
 def test_neither_scale_nor_frame_changes_the_parts() -> None:
