@@ -13,8 +13,10 @@ from sq_perception.files.version import __version__
 
 if TYPE_CHECKING:
     from sq_perception.evaluation.recovery_figure import recovery_figure
+    from sq_perception.fitting.decomposition import Parts, decompose
     from sq_perception.fitting.fit import Fit, Status
     from sq_perception.fitting.options import FitOptions
+    from sq_perception.fitting.points import fit_mesh, fit_points
     from sq_perception.fitting.surface_fit import fit
     from sq_perception.geometry.mesh import export as write_mesh
     from sq_perception.geometry.mesh import mesh, sample
@@ -32,6 +34,7 @@ __all__ = [
     "Fit",
     "FitOptions",
     "FrameRecovery",
+    "Parts",
     "RecordedFrame",
     "Recoverer",
     "Recovery",
@@ -39,7 +42,10 @@ __all__ = [
     "Status",
     "Superquadric",
     "__version__",
+    "decompose",
     "fit",
+    "fit_mesh",
+    "fit_points",
     "iou",
     "mesh",
     "read_frame",
@@ -55,13 +61,17 @@ _HOMES = {
     "Fit": "fitting.fit",
     "FitOptions": "fitting.options",
     "FrameRecovery": "recovery.recoverer",
+    "Parts": "fitting.decomposition",
     "RecordedFrame": "recordings.frame_file",
     "Recoverer": "recovery.recoverer",
     "Recovery": "recovery.recoverer",
     "RecoveryOptions": "recovery.recoverer",
     "Status": "fitting.fit",
     "Superquadric": "geometry.superquadric",
+    "decompose": "fitting.decomposition",
     "fit": "fitting.surface_fit",
+    "fit_mesh": "fitting.points",
+    "fit_points": "fitting.points",
     "iou": "geometry.metrics:volume_iou",
     "mesh": "geometry.mesh",
     "read_frame": "recordings.frame_file:read",

@@ -22,6 +22,7 @@ from sq_perception.learning.choices import NEEDS_TORCH
 COMMANDS = {
     "sample": ("sample:main", "write a simulated depth image to begin with"),
     "recover": ("recover:main", "depth images in, superquadrics out"),
+    "fit": ("fit:main", "clouds or meshes of single objects in, superquadrics out"),
     "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
     "render": ("render:main", "draw a superquadric as a depth image"),
     "demo": ("demo:main", "a simulated camera and real ROS 2 nodes (extra 'ros')"),

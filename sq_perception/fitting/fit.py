@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -80,3 +81,14 @@ class Fit:
     def sigma_size(self) -> np.ndarray:
         """Standard deviations (3,) of the half sizes, metres; NaN where unknown."""
         return np.sqrt(np.diag(self.covariance)[:3])
+
+    def signed_distance(self, points: np.ndarray, k_sigma: float = 0.0, *, gradient: bool = False) -> Any:
+        """A lower bound of the signed distance of points (n, 3) to the body, less so many standard deviations of it.
+
+        Shape (n,), metres, negative inside, and with ``gradient`` its gradient (n, 3) too, see
+        :mod:`sq_perception.geometry.signed_distance`.  Raises ValueError for deviations of a body without any.
+        """
+        from sq_perception.geometry.signed_distance import signed_distance  # here: a status alone compiles nothing
+
+        found = signed_distance(self.superquadric, points, self.covariance, k_sigma)
+        return found if gradient else found[0]

@@ -274,6 +274,17 @@ class Superquadric:
         length = xp.sqrt(xp.sum(gradient * gradient, axis=-1))
         return (gauge - 1) / xp.where(length > 0, length, xp.ones_like(length))
 
+    def signed_distance(self, points: np.ndarray, *, gradient: bool = False) -> Any:
+        """A lower bound of the signed distance of points (N, 3), metres, negative inside; NumPy bodies only.
+
+        Of the nearest body of a batch (k,), shape (N,), and with ``gradient`` its gradient (N, 3) too.  The bound, and
+        where it is exact: :mod:`sq_perception.geometry.signed_distance`.
+        """
+        from sq_perception.geometry.signed_distance import signed_distance
+
+        found = signed_distance(self, points)
+        return found if gradient else found[0]
+
     def _gauge_and_gradient(self, points: Array) -> tuple[Array, Array]:
         p = self.to_object(points)
         xp = array_namespace(p)

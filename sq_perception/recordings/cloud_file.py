@@ -16,11 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError
+from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError, npy_array
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 
 SUFFIXES = (".pcd", ".ply")
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")
+"""Files that may hold a mesh; a PLY or OBJ may be a cloud as well."""
 UNORGANISED = (
     "a cloud that is no image, seen from its origin, without points more than 60 degrees off its axis: nothing is "
     "known of the space beside an object, so that the side that is not seen is less sure; a depth image or an "
@@ -42,6 +44,12 @@ _WIDEST = 1.75
 several views have some below or beside the camera, and one of them is enough to leave no pixels for all others."""
 _MOST_UNSEEN = 1 / 3
 """Share of the points that are behind the camera or off its axis; more are those of another frame."""
+_LAYER, _MOST_LAYERED = 0.01, 0.5
+"""How far points stray from the plane through their neighbours in the image, as a share of their depth, where they are
+of two layers, a front and a back; and the largest share of such points in the cloud of one camera.  Seven to nine in
+ten of an object's from all sides, one in five of a sparse one of a crowded table from one."""
+_AROUND, _LAYER_SAMPLE = 16, 500
+"""Neighbours in the image of each of so many points."""
 _NEIGHBOURS = 2000
 """Points whose nearest neighbour gives the density of the cloud."""
 
@@ -65,6 +73,38 @@ def read_points(path: Path) -> np.ndarray:
     return points.astype(float)
 
 
+def read_surface(path: Path) -> Any:
+    """Points (n, 3) of a cloud, or the mesh of a file that has faces: ``vertices`` and ``faces``.
+
+    Raises
+    ------
+    UnpackingError
+        If the file is neither.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        array = npy_array(path)
+        if array.ndim != 2 or array.shape[1] != 3:
+            raise UnpackingError(f"expected an array of shape (n, 3), got {array.shape}")
+        return array
+    if suffix == ".pcd":
+        return read_points(path).reshape(-1, 3)
+    if suffix not in MESH_SUFFIXES:
+        raise UnpackingError(f"expected a name that ends in .pcd, .npy, {', '.join(MESH_SUFFIXES)}")
+    import trimesh
+
+    if path.stat().st_size > MOST_BYTES:
+        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    try:
+        found: Any = trimesh.load(path, file_type=suffix[1:], process=False, skip_materials=True)
+        found = found.to_geometry() if isinstance(found, trimesh.Scene) else found
+        if len(getattr(found, "faces", ())):
+            return found
+        return np.array(found.vertices, dtype=float).reshape(-1, 3)
+    except Exception as error:  # whatever damaged files lead to
+        raise UnpackingError(f"not a readable cloud or mesh: {type(error).__name__}: {error}") from error
+
+
 def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     """Depth (height, width), its camera, and whether the points were an image before.
 
@@ -83,7 +123,8 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     expected = (
         f"expected {_LEAST_POINTS} points or more, most of them before the camera: x right, y down, z forward from it; "
         f"of {count} points {behind:.0%} are behind it and {off:.0%} more than 60 degrees off its axis. A cloud in the "
-        "frame of a robot, a table or a map (z up) has to be transformed into the camera's optical frame"
+        "frame of a robot, a table or a map (z up) has to be transformed into the camera's optical frame; "
+        "clouds of whole objects are for sq-perception fit"
     )
     if behind > 0.5:
         expected += " (of clouds with z backward, as graphics has it, negate z, and y where it is up)"
@@ -94,14 +135,36 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
         x, y, z = points[v, u].astype(float).T
         tangents = np.stack([x / z, y / z], axis=1)
         (fx, cx), (fy, cy) = _line(tangents[:, 0], u), _line(tangents[:, 1], v)
-        off = np.abs(tangents * [fx, fy] + [cx, cy] - np.stack([u, v], axis=1))
-        if min(fx, fy) > 0 and np.count_nonzero(off < _PIXEL_ERROR) > _ON_PIXELS * off.size:
+        error = np.abs(tangents * [fx, fy] + [cx, cy] - np.stack([u, v], axis=1))
+        if min(fx, fy) > 0 and np.count_nonzero(error < _PIXEL_ERROR) > _ON_PIXELS * error.size:
             depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
             return depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), True
     if np.count_nonzero(near) < max(_LEAST_POINTS, (1 - _MOST_UNSEEN) * count):
         raise UnpackingError(expected)
     x, y, z = points[near].astype(float).T
-    return (*_seen(np.stack([x / z, y / z], axis=1), z), False)
+    tangents = np.stack([x / z, y / z], axis=1)
+    if (layered := _layered(tangents, z)) > _MOST_LAYERED:
+        raise UnpackingError(
+            f"{layered:.0%} of the points lie before or behind others, as in the cloud of a whole object and not in "
+            "that of one camera: sq-perception fit takes clouds of whole objects"
+        )
+    return (*_seen(tangents, z), False)
+
+
+def _layered(tangents: np.ndarray, z: np.ndarray) -> float:
+    """The share of points whose neighbours in the image lie on no common plane: those of a front and a back."""
+    from scipy.spatial import cKDTree
+
+    some = np.linspace(0, len(z) - 1, min(_LAYER_SAMPLE, len(z))).astype(int)
+    near = cKDTree(tangents).query(tangents[some], k=_AROUND)[1]
+    offset = tangents[near] - tangents[some][:, None]
+    offset /= np.maximum(np.abs(offset).max(axis=(1, 2), keepdims=True), 1e-12)
+    rows = np.concatenate([offset, np.ones((len(some), _AROUND, 1))], axis=2)
+    depth = z[near] / z[some][:, None]
+    transposed = np.swapaxes(rows, 1, 2)
+    plane = np.linalg.solve(transposed @ rows + 1e-9 * np.eye(3), transposed @ depth[..., None])
+    off = np.abs(depth - (rows @ plane)[..., 0])
+    return float(np.mean(np.median(off, axis=1) > _LAYER))
 
 
 def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:

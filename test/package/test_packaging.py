@@ -17,6 +17,8 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
+import sq_perception
+
 NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 PACKAGE = "sq_perception"
 

@@ -1,0 +1,280 @@
+"""Several superquadrics to the points or the mesh of one object: its parts.
+
+Bodies share the points as in :mod:`sq_perception.fitting.point_cost`: each point belongs to the nearest surface,
+softly, or to none.  Where the points close a volume, a grid tells what is outside of the object and what is inside:
+probes on either side, evenly in space, keep bodies out of the one and have them fill the other.
+
+The number of bodies is that of the shortest description (A. Leonardis, A. Jaklic, F. Solina, Superquadrics for
+Segmenting and Modeling Range Data, IEEE PAMI 19(11), 1997).  In nats, for k bodies with the log-likelihood L of n
+points,
+
+    D(k) = -(n_e / n) L + k p / 2 log n_e
+
+with p parameters a body and n_e independent witnesses: neighbouring points of a thing that is no superquadric err
+alike.  From one body on, each is split in two along each of its axes, and bodies are added where points or the inside
+are not explained; the likeliest union goes on.  In the end bodies without which the description is shorter are dropped.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sq_perception.fitting import point_cost, points
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.point_cloud import UnitCloud
+from sq_perception.fitting.point_cost import Cloud, Course, Mixture, Prior
+from sq_perception.geometry.signed_distance import signed_distance
+from sq_perception.geometry.superquadric import Superquadric
+
+MOST_PARTS = 6
+_POINTS, _PROBES = 800, 800
+"""Points, and probes of both sides together, that parts are fitted to."""
+_WITNESSES = 150.0
+"""n_e above."""
+_RESOLUTION = 0.015
+"""Least noise, in radii of the cloud: what a part may stray from a superquadric without another part."""
+_GRID = 28
+"""Cells along the longest side of the grid that tells inside from outside."""
+_ENCLOSED = 0.1
+"""Least volume inside, as a share of the cells with points, of a cloud that closes one."""
+_CLUSTER = 0.5
+"""Radius of a group of points that no body explains."""
+_QUICK, _THOROUGH = 8, 30
+"""Rounds of a candidate, and of the union that goes on."""
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """An object as a union of superquadrics.
+
+    Attributes
+    ----------
+    fits
+        The parts, the one with the most points first, each with its covariance, status and reason.
+    shares : (k,)
+        Share of the points that each explains.
+    status, message
+        How far the whole can be trusted, and why: that of the parts with a tenth of the points or more.
+    noise
+        Standard deviation of the points about the union, metres.
+    milliseconds
+        What it cost.
+    """
+
+    fits: tuple[Fit, ...]
+    shares: np.ndarray
+    status: Status
+    message: str
+    noise: float
+    milliseconds: float
+
+    @property
+    def superquadrics(self) -> Superquadric:
+        """The parts as a batch (k,)."""
+        return Superquadric.stack([fit.superquadric for fit in self.fits])
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __iter__(self) -> Iterator[Fit]:
+        return iter(self.fits)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (n, 3) are in one of the parts, (n,)."""
+        return np.asarray((self.superquadrics.gauge(np.asarray(points, dtype=float)[None]) <= 1).any(axis=0))
+
+    def signed_distance(self, points: np.ndarray, k_sigma: float = 0.0, *, gradient: bool = False) -> Any:
+        """As :meth:`Fit.signed_distance`, of the nearest part."""
+        covariances = np.stack([fit.covariance for fit in self.fits])
+        found = signed_distance(self.superquadrics, points, covariances, k_sigma)
+        return found if gradient else found[0]
+
+
+def decompose(
+    thing: Any, normals: np.ndarray | None = None, *, most: int = MOST_PARTS, sigma: float | None = None
+) -> Parts:
+    """The parts of one object, at most ``most`` of them.
+
+    Parameters
+    ----------
+    thing : (n, 3) or a mesh
+        Points of its surface, metres or any unit, in any frame; or what has ``vertices`` (n, 3) and ``faces`` (m, 3),
+        as a ``trimesh.Trimesh``.
+    normals : (n, 3), optional
+        Outward normals of points.
+    most
+        1 or more.
+    sigma
+        Standard deviation of the noise, in the unit of the points; None estimates it.
+
+    Raises
+    ------
+    ValueError
+        If an argument has the wrong form, or there is nothing finite in it.
+    """
+    began = time.perf_counter()
+    if most < 1:
+        raise ValueError(f"most: expected 1 or more parts, got {most}")
+    given, normals = points.surface_of(thing, normals)
+    cloud = UnitCloud.of(given, normals, points.MOST_POINTS)
+    reason = points.why_unfit(cloud)
+    if reason:
+        alone = points.unfit(cloud, reason, began)
+        return Parts((alone,), np.zeros(1), alone.status, reason, math.nan, alone.milliseconds)
+    search = _Search(cloud, _with_probes(cloud, given), points.prior_of(cloud, True), sigma)
+    mixture = search.pruned(search.grown(most))
+    return _assessed(cloud, mixture, began)
+
+
+def decompose_all(things: Sequence[Any], *, most: int = MOST_PARTS, jobs: int | None = None) -> list[Parts]:
+    """:func:`decompose` of many objects, ``jobs`` at a time (as many as there are cores if not given)."""
+    with ThreadPoolExecutor(jobs) as executor:  # kernels let other threads of Python compute
+        return list(executor.map(lambda thing: decompose(thing, most=most), things))
+
+
+class _Search:
+    """The unions of a cloud, from one body to the most."""
+
+    def __init__(self, cloud: UnitCloud, data: Cloud, prior: Prior, sigma: float | None) -> None:
+        self._cloud, self._data, self._prior = cloud, data, prior
+        self._least = _RESOLUTION if sigma is None else max(sigma / cloud.scale, 1e-4)
+
+    def grown(self, most: int) -> Mixture:
+        """The union of the shortest description; growing ends when two more bodies in a row do not shorten it."""
+        start = points.searched(self._cloud, None, "auto", True)
+        best = current = self._settled(start._replace(share=min(start.share, 0.3)), _THOROUGH)
+        misses = 0
+        while len(current.bodies) < most and misses < 2:
+            candidates = [self._settled(each, _QUICK) for each in self._candidates(current)]
+            if not candidates:
+                break
+            candidates.sort(key=lambda each: -each.likelihood)
+            current = max((self._settled(each, _THOROUGH) for each in candidates[:2]), key=lambda each: each.likelihood)
+            misses = 0 if self.description(current) < self.description(best) else misses + 1
+            best = best if misses else current
+        return best
+
+    def pruned(self, mixture: Mixture) -> Mixture:
+        """The union without the bodies that do not shorten its description."""
+        while len(mixture.bodies) > 1:
+            fewer = [
+                self._settled(
+                    mixture._replace(bodies=np.delete(mixture.bodies, k, 0), turns=np.delete(mixture.turns, k, 0)),
+                    _THOROUGH,
+                )
+                for k in range(len(mixture.bodies))
+            ]
+            shortest = min(fewer, key=self.description)
+            if self.description(shortest) >= self.description(mixture):
+                break
+            mixture = shortest
+        return mixture
+
+    def description(self, mixture: Mixture) -> float:
+        """D above."""
+        of_body = 0.5 * point_cost.STEP_LENGTH * math.log(_WITNESSES)
+        return -_WITNESSES / len(self._data.points) * mixture.likelihood + of_body * len(mixture.bodies)
+
+    def _settled(self, mixture: Mixture, rounds: int) -> Mixture:
+        course = Course(False, False, self._least, rounds, 1e-3, False)
+        return point_cost.settle(self._data, mixture, self._prior, course)
+
+    def _candidates(self, mixture: Mixture) -> Iterator[Mixture]:
+        bodies, turns = mixture.bodies, mixture.turns
+        wide = mixture._replace(sigma=max(mixture.sigma, 2 * _RESOLUTION))
+        for k in range(len(bodies)):
+            for axis in range(3):
+                halves = np.repeat(bodies[k][None], 2, axis=0)
+                halves[:, axis] *= 0.5
+                halves[:, 8:] = 0.0
+                step = turns[k][:, axis] * halves[0, axis]
+                halves[0, 5:8] -= step
+                halves[1, 5:8] += step
+                rest = np.delete(bodies, k, 0), np.delete(turns, k, 0)
+                both = np.repeat(turns[k][None], 2, axis=0)
+                yield wide._replace(bodies=np.concatenate([rest[0], halves]), turns=np.concatenate([rest[1], both]))
+        of_points = self._nearest(self._data.points, mixture)
+        unexplained = self._data.points[np.abs(of_points) > 2 * mixture.sigma]
+        within = self._data.probes[self._data.sides < 0]
+        unfilled = within[self._nearest(within, mixture) > 0] if len(within) else within
+        for some in (unexplained, unfilled):
+            if (box := _box_of_group(some)) is not None:
+                yield wide._replace(
+                    bodies=np.concatenate([bodies, box[0][None]]), turns=np.concatenate([turns, box[1][None]])
+                )
+
+    @staticmethod
+    def _nearest(some: np.ndarray, mixture: Mixture) -> np.ndarray:
+        return np.min(
+            [point_cost.distances(some, body, turn) for body, turn in zip(mixture.bodies, mixture.turns, strict=True)],
+            axis=0,
+        )
+
+
+def _box_of_group(some: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """A box (10,) around the largest group of the points, and its rotation; None where there are too few."""
+    from scipy.spatial import cKDTree  # here: a node that recovers does without
+
+    if len(some) < 2 * points.MIN_PIXELS:
+        return None
+    near = cKDTree(some).query_ball_point(some, _CLUSTER)
+    group = some[near[int(np.argmax([len(each) for each in near]))]]
+    if len(group) < points.MIN_PIXELS:
+        return None
+    turn = np.linalg.eigh(np.cov(group.T))[1]
+    turn *= math.copysign(1.0, float(np.linalg.det(turn)))
+    low, high = (group @ turn).min(axis=0), (group @ turn).max(axis=0)
+    half = np.maximum((high - low) / 2, 0.05)
+    return np.array([*half, 0.5, 0.5, *(turn @ (low + high) / 2), 0.0, 0.0]), np.ascontiguousarray(turn)
+
+
+def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
+    """The points of a cloud with probes outside and inside, where the points given (n, 3) close a volume."""
+    from scipy import ndimage  # here: a node that recovers does without
+
+    surface = cloud.surface(_POINTS)
+    dense = (given - cloud.centre) @ cloud.axes / cloud.scale
+    low, high = dense.min(axis=0), dense.max(axis=0)
+    side = float((high - low).max()) / _GRID
+    cells = np.clip(np.rint((dense - low) / side), 0, _GRID + 1).astype(int) + 2
+    count = np.zeros(np.ceil((high - low) / side).astype(int) + 6, np.int64)
+    np.add.at(count, tuple(cells.T), 1)
+    hit = count[count > 0]
+    occupied = count >= max(1.0, 0.2 * float(np.median(hit)))
+    wall = ndimage.binary_dilation(occupied)
+    labels, _ = ndimage.label(~wall)
+    outside = labels == labels[0, 0, 0]
+    inside = ~wall & ~outside
+    if np.count_nonzero(inside) < _ENCLOSED * np.count_nonzero(occupied):
+        return surface
+    probes, sides = [], []
+    for cell, sign in ((outside, 1.0), (inside, -1.0)):
+        at = np.argwhere(cell)
+        at = at[:: max(1, len(at) * 2 // _PROBES)]
+        probes.append((at - 2) * side + low)
+        sides.append(np.full(len(at), sign))
+    weight = 0.5 / (2 * _RESOLUTION) ** 2
+    owners = np.full(sum(len(each) for each in sides), -1)
+    return surface._replace(
+        probes=np.concatenate(probes), sides=np.concatenate(sides), owners=owners, probe_weight=weight
+    )
+
+
+def _assessed(cloud: UnitCloud, mixture: Mixture, began: float) -> Parts:
+    surface = cloud.surface()
+    none = np.zeros((len(cloud.points), len(mixture.bodies)))
+    shares = point_cost.shares(surface, mixture, none)[0].mean(axis=0)
+    order = np.argsort(-shares, kind="stable")
+    mixture = mixture._replace(bodies=mixture.bodies[order], turns=mixture.turns[order])
+    fits = tuple(points.assessed(cloud, mixture, k, began) for k in range(len(order)))
+    shares = shares[order]
+    worst = max((fit for fit, share in zip(fits, shares, strict=True) if share >= 0.1), key=lambda fit: fit.status)
+    milliseconds = (time.perf_counter() - began) * 1e3
+    return Parts(fits, shares, worst.status, worst.message, mixture.sigma * cloud.scale, milliseconds)

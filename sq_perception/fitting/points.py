@@ -1,0 +1,306 @@
+"""One superquadric to points from all sides of an object, or from some of them, without a camera.
+
+Maximum a posteriori under the mixture of :mod:`sq_perception.fitting.point_cost`: surface with normal noise, and
+outliers anywhere.  The search begins with boxes along the principal axes of the cloud and turned by 45 degrees against
+them, of the cloud's size and smaller, each axis as z; the likelier half goes on with more points, until one is left.
+Nothing is drawn at random.
+
+The covariance is that of the same normal equations.  Readings of one part of a surface may err together, as where the
+thing is no superquadric: with S_b the sum of the weighted residuals in each of 42 directions from the centre, n_b their
+number, the variance is multiplied by the mean of S_b^2 / n_b, which is 1 for independent noise, where that is above 1.
+
+Reference: W. Liu, Y. Wu, S. Ruan, G. S. Chirikjian, Robust and Accurate Superquadric Recovery: a Probabilistic
+Approach, CVPR 2022.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any, Literal
+
+import numpy as np
+
+from sq_perception.fitting import point_cost
+from sq_perception.fitting.covariance import carried_over
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.options import EXPONENTS, LARGEST_SIZE, MIN_PIXELS, SMALLEST_SIZE
+from sq_perception.fitting.point_cloud import UnitCloud, finite_points
+from sq_perception.fitting.point_cost import BODY_LENGTH, STEP_LENGTH, Cloud, Course, Mixture, Prior
+from sq_perception.fitting.quality import seen_extents
+from sq_perception.fitting.quality import status as assess
+from sq_perception.fitting.starts import ORDERS
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.support_directions import DIRECTIONS
+
+MOST_POINTS = 2000
+"""Points that are fitted of a larger cloud."""
+_STAGES = ((400, 4, 24), (800, 8, 4))
+"""Points, rounds and most bodies of each stage of the search."""
+_COARSE = 0.02
+"""Least noise of the search, in radii of the cloud: a part that is a perfect superquadric is not the whole thing."""
+_LAST_ROUNDS = 40
+"""Most rounds with all points; mostly six do."""
+_DENSE = 0.3
+"""Share of the points that are the densest: of a cloud with 60 % of outliers seven in eight of these are none."""
+_EIGHTH_TURNS = np.stack(
+    [np.eye(3), *(quaternions.to_matrix(quaternions.from_rotation_vector(np.eye(3) * math.pi / 4)))]
+)
+_SIGMA, _SHARE = 0.05, 0.5
+"""Noise of a start, in radii of the cloud, and its share of outliers: a start is off by about so much."""
+_TAPER_PRECISION = 10.0
+"""1 / variance of a taper before its points."""
+_PRIOR = np.array([1.0] * 3 + [0.5] * 2 + [1.0] * 3 + [1.0] * 3 + [0.5] * 2) ** -2.0
+"""Precision of the prior of a step: what points leave open has its width."""
+_OF_MESH = 20000
+"""Points that are drawn from a mesh."""
+FLAT = 1e-6
+"""Spread across a plane, as a share of that along it, below which points lie on it."""
+_MANY_OUTLIERS = 0.3
+_POINTS_A_DIRECTION = 3
+"""Points a direction, of all sides: of fewer, some directions have none by chance."""
+_ONE_SIDED = 0.75
+"""Share of 42 directions from the centre in which there must be points of an object that is seen from all sides."""
+
+
+def fit_points(
+    points: np.ndarray,
+    normals: np.ndarray | None = None,
+    *,
+    taper: bool = True,
+    outliers: float | Literal["auto"] = "auto",
+    sigma: float | None = None,
+) -> Fit:
+    """Fit one superquadric to points (n, 3) of an object's surface, from all sides or some.
+
+    Parameters
+    ----------
+    points : (n, 3)
+        Metres, or any unit, in any frame: the body comes back in the same.  Rows that are not finite are ignored.
+    normals : (n, 3), optional
+        Outward normals of the points, of any length: they tell inside from outside.
+    taper
+        Whether the body may be tapered along z.
+    outliers
+        Share of points that are not of the surface, 0 to below 1; ``"auto"`` estimates it with the body.
+    sigma
+        Standard deviation of the noise, in the unit of the points; None estimates it with the body.
+
+    Returns
+    -------
+    Fit
+        ``noise`` and ``inlier_share`` are the estimates of the mixture.  WEAK where the points leave a size open, or
+        many belong to no body; FAILED for fewer than 12 points and points on a plane or a line.
+
+    Raises
+    ------
+    ValueError
+        If an argument has the wrong form, or there is no finite point.
+    """
+    began = time.perf_counter()
+    kept, normals = surface_of(points, normals)
+    if outliers != "auto" and not 0 <= float(outliers) < 1:
+        raise ValueError(f'outliers: expected a share from 0 to below 1, or "auto", got {outliers}')
+    if sigma is not None and not (np.isfinite(sigma) and sigma > 0):
+        raise ValueError(f"sigma: expected a positive length, got {sigma}")
+    cloud = UnitCloud.of(kept, normals, MOST_POINTS)
+    reason = why_unfit(cloud)
+    if reason:
+        return unfit(cloud, reason, began)
+    found = searched(cloud, None if sigma is None else sigma / cloud.scale, outliers, taper)
+    return assessed(cloud, found, 0, began)
+
+
+def fit_mesh(mesh: Any, *, taper: bool = True) -> Fit:
+    """Fit one superquadric to a mesh, what has ``vertices`` and ``faces``, as :func:`fit_points` to points of it."""
+    drawn, normals = surface_of(mesh)
+    return fit_points(drawn, normals, taper=taper)
+
+
+def why_unfit(cloud: UnitCloud) -> str:
+    """Why no body can be fitted to a cloud; empty if one can."""
+    if len(cloud.points) < MIN_PIXELS:
+        return f"{len(cloud.points)} points; a fit needs {MIN_PIXELS}"
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(cloud.points.T)), 0))
+    if spread[1] <= FLAT * spread[2]:
+        return "the points lie on one line"
+    if spread[0] <= FLAT * spread[2]:
+        return "all points lie on one plane: nothing is known of the thickness"
+    return ""
+
+
+def prior_of(cloud: UnitCloud, taper: bool) -> Prior:
+    """What is believed of a body before the points of this cloud."""
+    extent, most = cloud.extent, 0.9 if taper else 0.0
+    middle = (cloud.points.max(axis=0) + cloud.points.min(axis=0)) / 2
+    least, largest = SMALLEST_SIZE * extent, LARGEST_SIZE * extent
+    lower = np.array([*[least] * 3, *[EXPONENTS[0]] * 2, *(middle - 2 * extent), -most, -most])
+    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(middle + 2 * extent), most, most])
+    return Prior(lower, upper, _TAPER_PRECISION, 0.5)
+
+
+def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Finite points (n, 3) of a surface and their normals, if any: of points themselves, or drawn evenly from a mesh.
+
+    A mesh has ``vertices`` (n, 3) and ``faces`` (m, 3), turned outwards; 20 000 points of it, and their normals, come
+    back, the same ones each time.
+    """
+    if hasattr(thing, "vertices") and hasattr(thing, "faces"):
+        corners = np.asarray(thing.vertices, dtype=float)[np.asarray(thing.faces, dtype=int)]
+        across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = np.linalg.norm(across, axis=1)
+        if not (area.size and np.isfinite(area).all() and area.sum() > 0):
+            raise ValueError("mesh: expected faces with an area, of finite vertices")
+        rng = np.random.default_rng(0)
+        at = (np.arange(_OF_MESH) + rng.random(_OF_MESH)) / _OF_MESH
+        face = np.searchsorted(np.cumsum(area), at * area.sum()).clip(max=len(area) - 1)
+        u, v = rng.random((2, _OF_MESH))
+        u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
+        corner, normal = corners[face], across[face] / np.maximum(area[face], 1e-300)[:, None]
+        spanned = u[:, None] * (corner[:, 1] - corner[:, 0]) + v[:, None] * (corner[:, 2] - corner[:, 0])
+        return corner[:, 0] + spanned, normal
+    kept, there = finite_points(thing)
+    if normals is None:
+        return kept, None
+    normals = np.asarray(normals, dtype=float)
+    if normals.shape != (len(there), 3):
+        raise ValueError(f"normals: expected {len(there)} rows as of the points, got shape {normals.shape}")
+    return kept, normals[there]
+
+
+def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper: bool) -> Mixture:
+    """The likeliest body of a cloud, tapered if it is likelier so than two more numbers cost."""
+    share = _SHARE if outliers == "auto" else float(outliers)
+    found = [Mixture(body[None], turn[None], _SIGMA, share, -math.inf) for body, turn in _starts(cloud)]
+    straight, tapered = prior_of(cloud, False), prior_of(cloud, True)
+    for number, rounds, most in _STAGES:
+        some = cloud.surface(number)
+        course = Course(False, outliers != "auto", _COARSE, rounds, 1e-3, False)
+        found = [point_cost.settle(some, each, straight, course) for each in found[:most]]
+        found.sort(key=lambda each: -each.likelihood)
+    candidates = [(found[0], straight)]
+    if taper:
+        turned = [point_cost.settle(some, each, tapered, course) for each in _in_all_orders(found[0])]
+        best = max(turned, key=lambda each: each.likelihood)
+        if best.likelihood > found[0].likelihood + math.log(len(some.points)):
+            candidates.append((best, tapered))
+    whole = cloud.surface()
+    course = Course(sigma is not None, outliers != "auto", 1e-4, _LAST_ROUNDS, 1e-5, True)
+    if sigma is not None:
+        candidates = [(each._replace(sigma=sigma), prior) for each, prior in candidates]
+    ends = [point_cost.settle(whole, each, prior, course) for each, prior in candidates]
+    return ends[-1] if ends[-1].likelihood > ends[0].likelihood + math.log(len(whole.points)) else ends[0]
+
+
+def _in_all_orders(mixture: Mixture) -> list[Mixture]:
+    """The single body of a mixture with each of its axes as z: the one along which it may be tapered."""
+    body, turn = mixture.bodies[0], mixture.turns[0]
+    found = [mixture]
+    for order in ORDERS[:2]:
+        other = np.array([*body[:3][order], *[body[3:5].mean()] * 2, *body[5:8], 0.0, 0.0])
+        found.append(mixture._replace(bodies=other[None], turns=np.ascontiguousarray(turn[:, order])[None]))
+    return found
+
+
+def _starts(cloud: UnitCloud) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Boxes (10,) along principal axes, and turned by 45 degrees against them, and their rotations (3, 3).
+
+    They are those of all points and those of the densest: outliers are spread through a volume, and so are sparse.
+    """
+    found = []
+    for some in (cloud.points, cloud.densest(_DENSE)):
+        principal = np.linalg.eigh(np.cov(some.T))[1]
+        principal *= math.copysign(1.0, float(np.linalg.det(principal)))
+        for turn in principal @ _EIGHTH_TURNS:
+            low, high = np.quantile(some @ turn, [0.05, 0.95], axis=0)
+            half = np.maximum((high - low) / 2, SMALLEST_SIZE * cloud.extent)
+            for order in ORDERS:
+                body = np.array([*half[order], 0.5, 0.5, *(turn @ (low + high) / 2), 0.0, 0.0])
+                found.append((body, np.ascontiguousarray(turn[:, order])))
+    return found
+
+
+def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: tuple[str, ...] = ()) -> Fit:
+    """The result of the k-th body of a mixture."""
+    surface = cloud.surface()
+    probability, distance, _ = point_cost.shares(surface, mixture, np.zeros((len(cloud.points), len(mixture.bodies))))
+    weight, off = probability[:, k], distance[:, k]
+    body, turn = mixture.bodies[k], mixture.turns[k]
+    covariance = covariance_of(surface, weight, mixture, k)
+    units = np.array([cloud.scale] * 3 + [1.0] * 2 + [cloud.scale] * 3 + [1.0] * 3)
+    world = np.eye(STEP_LENGTH - 2)
+    world[5:8, 5:8] = cloud.axes
+    covariance = units[:, None] * (world @ covariance[:11, :11] @ world.T) * units
+    fitted = cloud.body(body, turn)
+    canonical = fitted.canonical_form()
+    covariance = carried_over(covariance, fitted, canonical)
+    sigma = mixture.sigma * cloud.scale
+    inlying = weight > 0.5
+    own = cloud.points[inlying] @ cloud.axes.T * cloud.scale + cloud.centre
+    typical = float(np.median(np.abs(off[inlying]))) * cloud.scale if inlying.any() else math.inf
+    status, message = assess(canonical, covariance, typical, sigma, False)
+    notes = list(reasons)
+    if len(mixture.bodies) == 1 and _covered(cloud.points[inlying], body, turn) < _ONE_SIDED:
+        notes.append("seen from one side only: sq-perception recover knows more, with the camera that took the points")
+    if len(mixture.bodies) == 1 and mixture.share > _MANY_OUTLIERS:
+        notes.append(f"{mixture.share:.0%} of the points are on no surface of it: outliers, or parts of more bodies")
+    if float(canonical.size.min()) < 2 * sigma:
+        notes.append("it is no thicker than the noise: the points lie on one plane, as far as they tell")
+    if notes and status == Status.CONVERGED:
+        status, message = Status.WEAK, "; ".join(notes)
+    elif notes:
+        message = "; ".join([message, *notes])
+    return Fit(
+        superquadric=canonical,
+        residual=float(np.sqrt(np.sum(weight * off**2) / max(weight.sum(), 1e-9))) * cloud.scale,
+        status=status,
+        message=message,
+        noise=sigma,
+        inlier_share=float(weight.mean()),
+        seen=seen_extents(canonical, own) if len(own) else np.zeros(3),
+        covariance=covariance,
+        iterations=0,
+        milliseconds=(time.perf_counter() - began) * 1e3,
+    )
+
+
+def _covered(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> float:
+    """Share of the 42 directions from a body's centre in which there is one of some points (n, 3)."""
+    cells = _directions(some, body, turn)
+    return len(np.unique(cells)) / min(len(DIRECTIONS), max(1, len(cells) // _POINTS_A_DIRECTION))
+
+
+def _directions(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """In which of the 42 directions (n,) points lie from a body's centre, in units of its half sizes."""
+    return np.argmax(((some - body[5:8]) @ turn) / body[0:3] @ DIRECTIONS.T, axis=1)
+
+
+def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) -> np.ndarray:
+    """Covariance (13, 13) of sizes, exponents, centre, rotation vector and tapers, in units of the cloud."""
+    body, turn = mixture.bodies[k], mixture.turns[k]
+    none = Prior(np.full(BODY_LENGTH, -np.inf), np.full(BODY_LENGTH, np.inf), 0.0, 0.0)
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    residual = point_cost.distances(surface.points, body, turn) / mixture.sigma
+    scaled = weight / mixture.sigma**2
+    point_cost.normal_equations(
+        surface.points, np.zeros(len(weight)), np.zeros(len(weight)), scaled, body, turn, none, sums
+    )
+    cell = _directions(surface.points, body, turn)
+    number = np.bincount(cell, weight, len(DIRECTIONS))
+    together = np.bincount(cell, weight * residual, len(DIRECTIONS)) ** 2 / np.maximum(number, 1.0)
+    alike = max(1.0, float(together[number >= 1].mean()) if (number >= 1).any() else 1.0)
+    lower = np.tril(sums[:STEP_LENGTH, :STEP_LENGTH])
+    information = (lower + np.tril(lower, -1).T) / alike + np.diag(_PRIOR)
+    if not body[8:].any():  # straight, not by measurement but by choice
+        information[11:, :11] = information[:11, 11:] = 0.0
+    units = np.concatenate([body[0:3], np.ones(STEP_LENGTH - 3)])
+    covariance = units[:, None] * np.linalg.inv(information) * units
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def unfit(cloud: UnitCloud, reason: str, began: float, **more: Any) -> Fit:
+    """The result where no body can be fitted: a box about the points."""
+    half = np.maximum(np.ptp(cloud.points, axis=0) / 2, 0.01 * max(cloud.extent, 1e-6))
+    middle = (cloud.points.max(axis=0) + cloud.points.min(axis=0)) / 2
+    body = cloud.body(np.array([*half, 1.0, 1.0, *middle, 0.0, 0.0]), np.eye(3)).canonical_form()
+    return Fit(body, math.nan, Status.FAILED, reason, milliseconds=(time.perf_counter() - began) * 1e3, **more)
