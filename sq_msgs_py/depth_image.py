@@ -36,8 +36,8 @@ _DTYPES: dict[str, type[Any]] = {
     "32SC1": np.int32,
     "32FC1": np.float32,
 }
-_LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1.0, 1e6
-"""Pixels, of the whole image, that no camera goes beyond; a focal length of 1 is that of an identity, or normalised."""
+_LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1e-2, 1e6
+"""What no camera goes beyond; lines of sight computed with less or more are no longer numbers."""
 
 
 class ImageError(ValueError):
@@ -241,16 +241,6 @@ def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
     return text
 
 
-def no_focal_length(fx: float, fy: float) -> str:
-    """The complaint where focal lengths are no pixels; empty where they may be."""
-    if min(fx, fy) > _LEAST_FOCAL_LENGTH:
-        return ""
-    return (
-        f"expected focal lengths in pixels, some hundreds, got fx = {fx:g}, fy = {fy:g}: "
-        "an identity in place of the camera's matrix, or one that was divided by the size of the image?"
-    )
-
-
 def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
     """Intrinsics of the region of interest in its binned pixels from those of the full resolution."""
     if not all(math.isfinite(number) for number in (fx, fy, cx, cy)):
@@ -260,12 +250,10 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
             f"camera_info: expected focal lengths above 0, got fx = {fx:g}, fy = {fy:g}"
             + (" (the camera is not calibrated)" if fx == 0.0 and fy == 0.0 else "")
         )
-    if fault := no_focal_length(fx, fy):
-        raise ImageError(f"camera_info: {fault}")
-    if max(fx, fy, abs(cx), abs(cy)) > _MOST_PIXELS:
+    if min(fx, fy) < _LEAST_FOCAL_LENGTH or max(fx, fy, abs(cx), abs(cy)) > _MOST_PIXELS:
         raise ImageError(
-            f"camera_info: expected focal lengths and a principal point within {_MOST_PIXELS:g} pixels, "
-            f"got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
+            f"camera_info: expected focal lengths of {_LEAST_FOCAL_LENGTH:g} to {_MOST_PIXELS:g} pixels and a "
+            f"principal point within {_MOST_PIXELS:g}, got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
         )
     width, height = int(message.width), int(message.height)
     region = message.roi

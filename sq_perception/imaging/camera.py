@@ -23,8 +23,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sq_msgs_py.depth_image import no_focal_length
-
 Projection = Literal["pinhole", "orthographic"]
 LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
 """Median depths, metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
@@ -49,8 +47,8 @@ class Camera:
     Raises
     ------
     ValueError
-        For a size that is no whole number of pixels or below one, a focal length that is not positive, or anything not
-        finite.
+        For a size that is no whole number of pixels or below one, a focal length that is not positive, or of a pinhole
+        camera up to one pixel, or anything not finite.
     """
 
     width: int
@@ -71,6 +69,11 @@ class Camera:
             raise ValueError(f"fx fy cx cy: expected finite numbers, got {numbers}")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths: expected positive, got fx = {self.fx:g}, fy = {self.fy:g}")
+        if self.is_pinhole and min(self.fx, self.fy) <= 1:
+            raise ValueError(
+                f"focal lengths: expected pixels, some hundreds, got fx = {self.fx:g}, fy = {self.fy:g}: an identity "
+                "in place of the camera's matrix, or one that was divided by the size of the image?"
+            )
 
     @classmethod
     def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> Camera:
@@ -81,8 +84,6 @@ class Camera:
             raise ValueError(f"camera matrix: expected 3 x 3, got {k.shape}")
         if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
             raise ValueError(f"camera matrix: expected no skew, got {k[0, 1]:g}")
-        if k[0, 0] > 0 and (fault := no_focal_length(k[0, 0], k[1, 1])):
-            raise ValueError(fault)
         camera = cls(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
         if not np.allclose(k[2], [0, 0, 1]):
             turned = "; it seems to be transposed" if k[2, :2].any() and not k[:2, 2].any() else ""
