@@ -108,7 +108,7 @@ setup(
         "pyyaml>=6",  # camera_info files, training configurations
         "matplotlib>=3.7",  # pictures
         "pillow>=9.1",  # sizes of images before OpenCV decodes them; Matplotlib brings it anyway
-        "rich>=13",  # the live table of the demo
+        "rich>=13",  # bars of progress
     ],
     extras_require={
         # Never among the requirements: they would shadow the rclpy of a ROS installation.

@@ -137,7 +137,9 @@ def draw_grasps(
             where, words = pixels[-1], f"{number}: {grasp.score:.2f}"
         # Beyond the left half of the picture words go to the right, else to the left: they stay within it.
         side = "left" if where[0] < (left + right) / 2 else "right"
-        text = ax.text(where[0], where[1], f" {words} ", color=INK, fontsize=10, weight="bold", ha=side, va="center", clip_on=True)
+        text = ax.text(
+            where[0], where[1], f" {words} ", color=INK, fontsize=10, weight="bold", ha=side, va="center", clip_on=True
+        )
         text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])  # the picture may be as dark as INK
     shown = np.vstack(spots)
     shown = shown[np.isfinite(shown).all(axis=1)]

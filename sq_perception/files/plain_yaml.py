@@ -22,25 +22,6 @@ class YamlError(ValueError):
     """A file that cannot be read, or is no plain YAML; the message has the reason."""
 
 
-class _PlainLoader(yaml.SafeLoader):
-    """The safe loader, without aliases and deep nesting."""
-
-    def __init__(self, stream: str) -> None:
-        super().__init__(stream)
-        self._depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        if self.check_event(yaml.AliasEvent):
-            raise YamlError("expected plain data, got an alias (*)")
-        self._depth += 1
-        if self._depth > DEEPEST:
-            raise YamlError(f"expected at most {DEEPEST} levels of nesting")
-        try:
-            return super().compose_node(parent, index)
-        finally:
-            self._depth -= 1
-
-
 def read_all(path: Path) -> list[Any]:
     """The documents of a file.
 
@@ -61,7 +42,14 @@ def documents(data: bytes) -> list[Any]:
     if len(data) > LARGEST:
         raise YamlError(f"expected at most {LARGEST} bytes")
     try:
-        return list(yaml.load_all(data.decode("utf-8"), Loader=_PlainLoader))
+        text, depth = data.decode("utf-8"), 0
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise YamlError("expected plain data, got an alias (*)")
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > DEEPEST:
+                raise YamlError(f"expected at most {DEEPEST} levels of nesting")
+        return list(yaml.safe_load_all(text))
     except (UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, YamlError):
             raise

@@ -125,8 +125,7 @@ class TrainingConfig:
     optimizer: str = _setting("adamw", "adamw, or adam as in the thesis.")
     schedule: str = _setting(
         "cosine",
-        "cosine: warm up, then fall to 0; plateau: divide by 10 after 10 "
-        "validations without progress, stop after 20.",
+        "cosine: warm up, then fall to 0; plateau: divide by 10 after 10 validations without progress, stop after 20.",
     )
     learning_rate: float = _setting(1.5e-3, "The largest learning rate.")
     weight_decay: float = _setting(1e-2, "For adamw; adam has none.")

@@ -17,7 +17,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message, size_mismatch
+from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message
 from sq_msgs_py.points import points_from_message
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Calibration
@@ -130,20 +130,6 @@ def decode(
     if kind == "range":
         depth = depth_units.z_from_range(depth, calibration.camera)
     return Frame(message.header, encoding, depth, calibration, notes=found.notes)
-
-
-def decode_by(info: CameraInfo | None, image: Image, topic: str) -> Frame:
-    """The frame of a plain image by the last camera_info of its camera; errors as of :func:`decode`."""
-
-    def calibration() -> Calibration:
-        if info is None:
-            raise ValueError("no camera_info has come")
-        found = Calibration.of(info, topic)
-        if found.size != size_of(image):
-            raise ValueError(size_mismatch(size_of(image), found.size))
-        return found
-
-    return decode(image, None if image.encoding in GREY_ENCODINGS else calibration)
 
 
 def image_topic(node: Node, transport: str) -> str:
