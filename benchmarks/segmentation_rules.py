@@ -54,6 +54,7 @@ FIGURES = ("found", "nothing", "pieces", "iou")
 _S = "sq_perception.segmentation"
 _OWN = "sq_perception.recovery.own_segments"
 RULES: dict[str, dict[str, Any]] = {
+    "walls around things (enclosures)": {f"{_S}.enclosures.walls": lambda *_: set()},
     "level tops (level_faces)": {f"{_S}.level_faces.found": lambda *_: []},
     "ramps (risen)": {f"{_S}.support_surface.risen": lambda relative, *_: np.zeros(relative.shape, bool)},
     "a bent support": {f"{_S}.support_surface._GAIN": np.inf},
