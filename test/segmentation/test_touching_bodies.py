@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from table_scenes import VGA, Table, ious, noisy, judged_by_network
+from table_scenes import VGA, Table, ious, judged_by_network, noisy
 
 from sq_perception.segmentation.segments import segment
 from sq_perception.simulation.scenes import plane_depth
