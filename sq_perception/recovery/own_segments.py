@@ -21,7 +21,8 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
     left      what is left by strays and by dropped segments, in pieces that are as large as an object, is asked about
               once more: a piece is an object if it is a thing, and no other segment is of its object
 
-The network is asked once about a segment, and again about one that was parted or joined.
+Without a support plane it parts nothing.  The network is asked once about a segment, and again about one that was
+parted or joined.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ class SegmentNetwork:
             return found
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
-        parts = self._parted(labels, seen, found.sigma)
+        parts = [] if self.plane is None else self._parted(labels, seen, found.sigma)
         if parts:
             seen |= self._seen(labels, parts)
         for _ in range(_ROUNDS if len(seen) > 1 else 0):

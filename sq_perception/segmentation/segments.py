@@ -8,15 +8,15 @@ Steps
    where none between them does (:mod:`sq_perception.segmentation.bodies`).
 3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
    than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
-4. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
+4. Walls of a bin or a tray around things go (:mod:`sq_perception.segmentation.enclosures`).
+5. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
    its surroundings sharpens (:mod:`sq_perception.recovery.own_segments`).
-5. Limits of size and place, and of number, are asked of what then remains.
+6. Limits of size and place, and of number, are asked of what then remains.
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
-Things on a higher table are found as well, those on a lower one are not.  Where no support is seen all readings are
-taken apart; where they are a silhouette no larger than a thing, as of a masked image, they are that thing.  An
-orthographic camera sees the thesis' world: there is no plane, and every connected set of pixels in the workspace is an
-object, of any size.
+Things on a higher table are found as well, those on a lower one are not.  Where no support is seen, or the readings are
+a silhouette no larger than a thing, as of a masked image, all of them are taken apart.  An orthographic camera sees the
+thesis' world: there is no plane, and every connected set of pixels in the workspace is an object, of any size.
 
 Metres and pixels.
 """
@@ -34,6 +34,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     bodies,
     convex_parts,
+    enclosures,
     level_faces,
     objectness,
     pieces,
@@ -54,6 +55,8 @@ _MOST = 128
 """Segments that are looked at, the largest ones: bounds the time of frames that are noise alone."""
 _SIDE_MEASURED = 0.6
 """Share of a side of the readings' box from which on they go on beyond it: a silhouette touches it here and there."""
+_LEAST_PIECE = 0.02
+"""Share of a silhouette no larger than a thing that one of several things in it has at least."""
 _POINTS = 400
 """Points of a segment for its size and its middle."""
 
@@ -133,11 +136,11 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     is_silhouette = _is_silhouette(valid)
     if is_silhouette and largest_edge(_some_points(valid, known, camera)) <= LARGEST_THING:
-        return _ordered(Segmentation(depth_steps.components(valid), None, ()), least)
+        return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera)
     if plane is None:
-        return _without_support(known, valid, camera)
+        return _without_support(known, valid, camera, least)
     support = support_surface.measured(plane, known, valid, camera)
     relative = support.image_relative(known, camera)
     labels = bodies.above(known, camera, relative, valid, support)
@@ -145,9 +148,11 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     tops = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(tops, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, camera, least)
+    around = enclosures.walls(tops, plane.equation)
+    labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
     found = _ordered(Segmentation(labels, plane.equation, (), sigma), least)
     if is_silhouette and not found.ids:
-        return _without_support(known, valid, camera)
+        return _without_support(known, valid, camera, least)
     return replace(found, heights=HeightEvidence(relative, found.labels, support.sigma))
 
 
@@ -303,10 +308,10 @@ def _is_silhouette(valid: np.ndarray) -> bool:
     return bool(sorted(sides)[-2] < _SIDE_MEASURED)
 
 
-def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera) -> Segmentation:
+def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least: int) -> Segmentation:
     """The segments of an image that shows no support plane, but those that fill it, as a wall does."""
     labels = bodies.taken_apart(known, valid, camera, _UNKNOWN_SIGMA)
-    found = _ordered(Segmentation(labels, None, ()), least_pixels(valid.size))
+    found = _ordered(Segmentation(labels, None, ()), least)
     extents = regions.extents(found.labels)[:, [3, 1, 4, 2]]
     boxes = {k: (extents[k, 0], extents[k, 1], *(extents[k, 2:] - extents[k, :2])) for k in found.ids}
     return kept(found, {k: 1.0 for k, box in boxes.items() if _is_silhouette(valid) or not regions.fills(box, valid)})

@@ -23,6 +23,7 @@ from sq_perception.learning import checkpoint
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
+from sq_perception.segmentation import segments
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
@@ -262,7 +263,7 @@ def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
     depth, truth = table.see([table.body(-0.1, 0, (0.06, 0.06, 0.05)), table.body(0.12, 0, (0.03, 0.03, 0.03))])
 
     def without_the_largest(_, found):
-        return replace(found, labels=np.maximum(found.labels - 1, 0), ids=found.ids[:-1])
+        return segments.kept(found, dict.fromkeys(found.ids[1:], 1.0))
 
     monkeypatch.setattr(own_segments.SegmentNetwork, "improved", without_the_largest)
     found = Recoverer().recover(depth, VGA, options=RecoveryOptions(max_objects=1))

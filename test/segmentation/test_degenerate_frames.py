@@ -259,7 +259,7 @@ def wild(body: Recovery, frame: Frame, found: FrameRecovery) -> str:
 def check(found: FrameRecovery, frame: Frame) -> None:
     """The answer is whole, its numbers are numbers, and no body is wild."""
     assert found.labels.shape == frame.depth.shape
-    assert bool(found.message) == (not found.bodies)
+    assert found.message or found.bodies
     for body in found.bodies:
         assert np.isfinite(body.superquadric.to_flat()).all()
         assert (body.superquadric.size > 0).all()

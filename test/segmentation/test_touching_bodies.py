@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from table_scenes import VGA, Table, ious, noisy
+from table_scenes import VGA, Table, ious, judged_by_network, noisy
 
 from sq_perception.segmentation.segments import segment
 from sq_perception.simulation.scenes import plane_depth
@@ -168,7 +168,7 @@ def test_the_largest_of_many_is_found_among_low_ones():
 def test_touching_bodies_without_a_table():
     bodies = PARTED["can before a box"]
     depth, truth = TABLE.see(bodies, 0.001, table=False)
-    found = segment(depth, VGA)
+    found = judged_by_network(depth, VGA)
     assert found.plane is None
     assert len(found.ids) == 2
     assert min(ious(truth, found.labels)) > 0.95
