@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sq_perception.fitting import covariance, hull_prior, priors, surface_fit
+from sq_perception.fitting import covariance, priors, surface_fit
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.covariance import covariance_at
 from sq_perception.fitting.hull_prior import EDGE_SHARE, MODEL_SHARE, PULL_SHARE, HullPrior
