@@ -96,8 +96,9 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = problem.draw(COARSE_RAYS, 0.7)
-    begun = by_cost(problem.in_time(starts, lambda start: problem.settle(start, few, FIRST_STEPS)))
-    settled = by_cost(problem.in_time(begun[:_KEPT], lambda state: problem.settle(state, few)))
+    straight = problem.within(taper=0.0)
+    begun = by_cost(problem.in_time(starts, lambda start: straight.settle(start, few, FIRST_STEPS)))
+    settled = by_cost(problem.in_time(begun[:_KEPT], lambda state: straight.settle(state, few)))
     if problem.hull is None:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
