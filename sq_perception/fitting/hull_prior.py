@@ -22,10 +22,6 @@ import numpy as np
 PULL_SHARE = 0.07
 """Standard deviation, as a share of the thing's extent, of the pull on a body that misfits twice as much as the best
 do.  On 408 things of benchmarks/household_things, seeds from 5000, 0.05 to 0.14 change IoU by less than 0.2 %."""
-EDGE_SHARE = 0.03
-"""Standard deviation, likewise, of the pull on its edges: in directions near its own axes all of the difference counts,
-growth too.  On 1045 of these things, seeds from 8700, edges err by 7 % less with it, those of bottles by 7, of tools by
-16 and of vessels by 20 %, at 0.1 +- 0.1 % of IoU.  On 622 others 0.02 gains another 1 % and costs 0.3 % of IoU."""
 _NEAR_AXIS = 16
 """Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
 degrees apart."""
@@ -58,26 +54,19 @@ class HullPrior:
     extent: float
     freedom: float = math.inf
 
-    def root(self, misfit: float = 1.0, rotation: np.ndarray | None = None) -> np.ndarray:
-        """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions)
-        + (misfit - 1) / edge^2 near the axes.
+    def root(self, misfit: float = 1.0) -> np.ndarray:
+        """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions).
 
-        ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits; ``rotation`` (3, 3)
-        has the body's axes for columns.
+        ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits.
 
         The most probable body is not the one nearest to the prediction.  A superquadric that fits has the thing's form,
         and S tells how probable each form is.  One that does not fit is a compromise: b is the best that is known of
         the thing's form, and the body is to be near to it in each direction, however uncertain.  Growth in all
-        directions is left to S, as the outline determines a thing's size, except at the ends of the body's axes:
-        whatever its form, the body is to be as long, wide and high as the thing.  Otherwise the body of a bottle, as
-        superquadrics cannot taper, is too thin for its foot.
+        directions is left to S, as the outline determines a thing's size.
         """
         count = len(self.support)
         pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
         precision = self._precision + pull * (np.eye(count) - 1.0 / count)
-        if rotation is not None:
-            near = near_axes(self.directions, rotation).sum(axis=1)
-            precision += (misfit - 1.0) / (EDGE_SHARE * self.extent) ** 2 * np.diag(near)
         return np.ascontiguousarray(np.linalg.cholesky(precision).T)
 
     @cached_property

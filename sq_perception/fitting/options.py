@@ -15,8 +15,9 @@ SMALLEST_SIZE = 0.02
 """Smallest size, as a share of the observed extent: 6 mm of 30 cm."""
 LARGEST_SIZE = 2.0
 """Largest size, likewise: a body may hide as much again as it shows."""
-EXPONENTS = (0.1, 1.0)
-"""Least and largest exponent of a fit: from boxes to ellipsoids, as in the thesis."""
+EXPONENTS = (0.03, 1.0)
+"""Least and largest exponent of a fit: from boxes to ellipsoids.  The thesis' least, 0.1, rounds the rims of sharp cans
+by a millimetre or two, and the fit makes these longer instead."""
 TAPER = 0.8
 """Largest taper of a fit, where bodies may taper: beyond, a bottle would be a cone."""
 MIN_PIXELS = 12

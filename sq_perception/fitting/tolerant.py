@@ -16,9 +16,11 @@ Where a hull is predicted, the body is fitted to the thing's convex hull, which 
 handles: points behind the surface count by Cauchy's loss, and space within the outline's convex hull may be empty.  The
 object then counts as INDEPENDENT_OF_PREDICTED / m rays, m = max(1, c / EXPLAINED), c their mean loss: the variance of
 the model's error is not known beforehand, and the likelihood maximised over it divides by the variance found.  The more
-the body misfits, the more it is drawn to the predicted hull (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`),
-its edges most of all.  That pull does not count towards the covariance, and there the rays count as fewer by m once
-more: larger errors extend over larger parts, such as a neck, a spout or a dent.
+the body misfits, the more it is drawn to the predicted hull (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).
+That pull does not count towards the covariance, and there the rays count as fewer by m once more: larger errors extend
+over larger parts, such as a neck, a spout or a dent.
+
+Beside a predicted hull a body may taper, if the evidence is for it (docs/surface_fit.md).
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
 2. A few steps from each on few rays; more from the best, which determines c.
@@ -96,14 +98,15 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = problem.draw(COARSE_RAYS, 0.7)
-    begun = by_cost(problem.in_time(starts, lambda start: problem.settle(start, few, FIRST_STEPS)))
-    settled = by_cost(problem.in_time(begun[:_KEPT], lambda state: problem.settle(state, few)))
+    straight = problem.within(taper=0.0)
+    begun = by_cost(problem.in_time(starts, lambda start: straight.settle(start, few, FIRST_STEPS)))
+    settled = by_cost(problem.in_time(begun[:_KEPT], lambda state: straight.settle(state, few)))
     if problem.hull is None:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms
     if misfit > 1.0:
-        terms = terms._replace(hull_root=problem.hull.root(misfit, settled[0].rotation))
+        terms = terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
     if not problem.late:
         few = drawn.draw(COARSE_RAYS, 0.7)

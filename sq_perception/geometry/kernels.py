@@ -251,7 +251,8 @@ def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
             change = excess - excess_before[i]
             ahead = at - excess * (at - before[i]) / (change if change != 0.0 else 1.0)
             ahead = sine if step == 0 else ahead
-            s[i] = ahead if (left < ahead) & (ahead < right) else 0.5 * (left + right)
+            ahead = ahead if (left < ahead) & (ahead < right) else 0.5 * (left + right)
+            s[i] = at if abs(excess) < _SUPPORT_TOLERANCE else ahead
             low[i], high[i], before[i], excess_before[i] = left, right, at, excess
         for i in range(count):
             farthest = max(farthest, abs(excess_before[i]))

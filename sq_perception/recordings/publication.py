@@ -158,9 +158,7 @@ class Findings:
     def meshes(self) -> tuple[Mesh, ...]:
         """Surface of each body that did not fail, in the body's own frame; made when it is first asked for."""
         shown = self.array.recovered
-        return tuple(
-            triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(shown)
-        )
+        return tuple(triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(shown))
 
     def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
         """The same in another frame, p_new = R(rotation) p + translation; the stamp stays."""

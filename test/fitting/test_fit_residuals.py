@@ -177,7 +177,7 @@ def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random
 
 
 def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
-    body = random_body(rng)
+    body = random_body(rng, taper=(0.3, -0.2))
     normal = np.array([0.1, -0.9, -0.3])
     normal /= np.linalg.norm(normal)
     plane = np.append(normal, -normal @ body.translation + 0.4 * body.size.min())

@@ -233,7 +233,8 @@ class TestKernels:
         for body in random_bodies(200, 29, 0.05, 2.0):
             origin, direction = rng.standard_normal(3), rng.standard_normal(3)
             direction -= 0.8 * (origin + direction)
-            hit, first, last = kernels.ray_interval(tuple(origin), tuple(direction), (*body.size, *body.shape, 0.0, 0.0))
+            form = *body.size, *body.shape, 0.0, 0.0
+            hit, first, last = kernels.ray_interval(tuple(origin), tuple(direction), form)
             t = np.linspace(-5, 10, 4001)
             moved = Superquadric(body.size, body.shape, np.zeros(3), IDENTITY)
             g = moved.gauge(origin + t[:, None] * direction)

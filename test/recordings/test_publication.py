@@ -26,6 +26,15 @@ def array(found: publication.Identified):
     return publication.superquadric_array(found, is_cube=False)
 
 
+def test_a_message_of_a_body_that_tapers_encloses_it_without_the_taper_and_is_it_with(rng):
+    tapered = Superquadric(BODY.size, BODY.shape, BODY.translation, BODY.rotation, [0.4, -0.2])
+    shown = array(publication.identified(recovery(Status.CONVERGED, body=tapered)))
+    read = Superquadric(shown.size, shown.shape, shown.translation, shown.rotation)
+    surface = tapered.sample_surface(500, rng)
+    assert (read[0].gauge(surface) < 1 + 1e-6).all()
+    np.testing.assert_allclose(publication.superquadrics(shown)[0].gauge(surface), 1.0, atol=1e-5)
+
+
 def test_a_weak_body_names_the_axis_that_is_open():
     """0.02 of 0.04 m along y; a body that converged or failed gives no reason."""
     (reason,) = array(publication.identified(recovery(Status.WEAK))).reason

@@ -33,6 +33,17 @@ def test_numbers_are_those_of_the_tracks_in_the_optical_frame(rng):
     assert np.mean(fused) < np.mean(raw)
 
 
+def test_a_body_that_tapers_does_so_in_whichever_form_it_is_seen(rng):
+    straight = body()
+    truth = Superquadric(straight.size, straight.shape, straight.translation, straight.rotation, [0.4, -0.2])
+    points = truth.translation + rng.uniform(-0.06, 0.06, (50, 3))
+    one = TrackingSession()
+    for k, form in enumerate(truth.equivalent_forms()):
+        (found,) = one.follow([Seen(form, noise())], 0.1 * k)
+        assert found.is_fused
+        np.testing.assert_allclose(found.superquadric.gauge(points), truth.gauge(points), rtol=1e-6)
+
+
 def test_a_body_moved_by_a_hand_is_never_published_where_it_was(rng):
     """3 cm, then 8 cm, then a quarter turn: in the very frame of the motion the observation itself comes out."""
     one, truth = TrackingSession(), body()
