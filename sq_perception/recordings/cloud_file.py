@@ -138,8 +138,8 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
         raise UnpackingError(expected)
     if (layered := _layered(tangents[near], z[near])) > _MOST_LAYERED:
         raise UnpackingError(
-            f"{layered:.0%} of the points lie before or behind others, as in the cloud of a whole object and not in that "
-            "of one camera: sq-perception fit takes clouds of whole objects"
+            f"{layered:.0%} of the points lie before or behind others, as in the cloud of a whole object and not in "
+            "that of one camera: sq-perception fit takes clouds of whole objects"
         )
     return (*_seen(tangents[near], z[near]), False)
 

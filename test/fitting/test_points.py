@@ -148,11 +148,11 @@ def test_missing_points_are_ignored_and_misuse_raises() -> None:
     points[::3] = np.nan
     assert iou(sq.fit_points(points), BODY) > 0.99
     for wrong, message in (
-        (dict(points=np.zeros((5, 2))), "shape"),
-        (dict(points=np.full((5, 3), np.nan)), "no finite point"),
-        (dict(points=points, normals=np.zeros((3, 3))), "normals"),
-        (dict(points=points, outliers=1.0), "outliers"),
-        (dict(points=points, sigma=0.0), "sigma"),
+        ({"points": np.zeros((5, 2))}, "shape"),
+        ({"points": np.full((5, 3), np.nan)}, "no finite point"),
+        ({"points": points, "normals": np.zeros((3, 3))}, "normals"),
+        ({"points": points, "outliers": 1.0}, "outliers"),
+        ({"points": points, "sigma": 0.0}, "sigma"),
     ):
         with pytest.raises(ValueError, match=message):
             sq.fit_points(**wrong)
