@@ -97,11 +97,11 @@ def _fitted(name: str, surface: Any, options: argparse.Namespace) -> dict[str, A
     points, normals = surface_of(surface)
     whole: Parts | Fit
     if options.most > 1:
-        parts = decompose(points, normals, most=options.most, sigma=options.sigma)
-        fits, shares, whole = list(parts), [float(share) for share in parts.shares], parts
+        whole = parts = decompose(points, normals, most=options.most, sigma=options.sigma)
+        fits, shares = list(parts), [float(share) for share in parts.shares]
     else:
-        fit = fit_points(points, normals, taper=not options.no_taper, sigma=options.sigma)
-        fits, shares, whole = [fit], [fit.inlier_share], fit
+        whole = fit = fit_points(points, normals, taper=not options.no_taper, sigma=options.sigma)
+        fits, shares = [fit], [fit.inlier_share]
     bodies = [_entry(fit, share) for fit, share in zip(fits, shares, strict=True)]
     return {
         "file": name,

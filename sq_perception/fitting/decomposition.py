@@ -36,9 +36,9 @@ from sq_perception.geometry.superquadric import Superquadric
 MOST_PARTS = 6
 _POINTS, _PROBES = 800, 800
 """Points, and probes of both sides together, that parts are fitted to."""
-_WITNESSES = 150.0
+_WITNESSES = 600.0
 """n_e above."""
-_RESOLUTION = 0.015
+_RESOLUTION = 0.01
 """Least noise, in radii of the cloud: what a part may stray from a superquadric without another part."""
 _GRID = 28
 """Cells along the longest side of the grid that tells inside from outside."""
