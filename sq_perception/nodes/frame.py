@@ -24,7 +24,6 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.parameters import POINTS, RAW
 from sq_perception.recordings import cloud_file, publication
-from sq_perception.recordings.publication import size_of
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3

@@ -113,8 +113,8 @@ def test_a_full_disk_leaves_whole_lines(path, file_size_limit):
 def test_a_row_a_body_with_the_numbers_of_the_document():
     body = {
         "size": [0.1, 0.2, 0.3], "sigma_size": [0.01, None, 0.03], "shape": [0.5, 1.0], "translation": [1.0, 2.0, 3.0],
-        "rotation": [0.0, 0.0, 0.0, 1.0], "seen": [1.0, 0.5, None], "score": 0.9, "residual": 0.001, "pixels": 99, "objectness": 0.75,
-        "taper": [0.0, 0.0],
+        "rotation": [0.0, 0.0, 0.0, 1.0], "seen": [1.0, 0.5, None], "score": 0.9, "residual": 0.001, "pixels": 99,
+        "objectness": 0.75, "taper": [0.0, 0.0],
         "label": None, "message": "converged; a, b", "status": "converged", "track": {"id": 7},
     }  # fmt: skip
     stamp = {"sec": 3, "nanosec": 40}
