@@ -84,7 +84,7 @@ class RecoverParameters(Parameters):
         0.0,
         "Units a metre of depth images and points; 0: 1000 of 16UC1, 1 of 32FC1 and points. 32FC1 in millimetres: "
         "1000; a D405's 16UC1: 10000.",
-        within=(0.0, 1e6),
+        within=(0.0, 1e5),
     )
     depth_kind: DepthKind = setting(
         "z",

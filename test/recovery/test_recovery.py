@@ -221,7 +221,7 @@ def test_depths_in_millimetres_are_said(symmetry, masked):
     depth, labels = seen([random_bodies(1, 3, scale=0.1)[0]], CAMERA)
     for scale, is_said in ((1, False), (1000, True)):
         found = symmetry.recover((scale * depth).astype(np.float32), CAMERA, labels if masked else None)
-        assert ("not millimetres" in found.message) == is_said
+        assert ("for millimetres" in found.message) == is_said
 
 
 def test_masks_without_an_object_say_so_and_ones_of_another_size_are_refused(symmetry):
