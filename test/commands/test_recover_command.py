@@ -20,7 +20,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
-from sq_perception.recordings import still_page
+from sq_perception.recordings import html_page
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
@@ -480,7 +480,7 @@ def test_a_bag_that_was_begun_is_forgotten_where_the_page_cannot_be(tmp_path, mo
     def full(path):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(still_page, "StillPage", full)
+    monkeypatch.setattr(html_page, "HtmlPage", full)
     frame, outputs = save_npz(tmp_path / "a.npz"), tmp_path / "outputs"
     outputs.mkdir()
     assert run(frame, "--mcap", outputs / "out.mcap", "--html", outputs / "out.html") == 1
