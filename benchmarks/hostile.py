@@ -17,7 +17,6 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-from children import Children
 from common import (
     own_domain,  # noqa: F401
     report,
@@ -26,6 +25,7 @@ from hostile_messages import HostileFrame, Siege, Verdict, difference, frames
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from running_nodes import Peer, arguments, environment, until, usage
 from sensor_msgs.msg import Image
+from started_nodes import Children
 
 from sq_msgs_py.superquadrics import from_message
 

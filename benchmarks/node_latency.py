@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from children import Children
 from common import (
     own_domain,  # noqa: F401
     report,
 )
 from running_nodes import Peer, arguments, environment, until, usage
+from started_nodes import Children
 
 from sq_perception.recordings import frame_source
 

@@ -20,7 +20,6 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from children import Children
 from common import (
     own_domain,  # noqa: F401
     report,
@@ -36,6 +35,7 @@ from running_nodes import (
     until,
     usage,
 )
+from started_nodes import Children
 from std_srvs.srv import SetBool
 
 CAMERA_NODE = "synthetic_depth_node"

@@ -19,7 +19,8 @@ import sq_perception
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 _STARTING = {
-    *("subprocess", "browser", "children", "running_nodes", "respawned_nodes", "hostile_messages", "sealed_network")
+    *("subprocess", "browser", "sealed_network"),
+    *("started_nodes", "running_nodes", "respawned_nodes", "hostile_messages"),
 }
 """Modules by which tests start processes."""
 

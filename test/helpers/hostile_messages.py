@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from children import Child
 from hypothesis import strategies as st
 from running_nodes import Peer, until
 from sensor_msgs.msg import CameraInfo, Image, RegionOfInterest
+from started_nodes import Child
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 

@@ -20,9 +20,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from children import Child
 from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
+from started_nodes import Child
 
 from sq_perception.nodes.fast_dds import FOLDER
 

@@ -12,11 +12,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from children import Children
 from hostile_messages import HostileFrame, Siege, difference, frames, hostile_infos, images, masks, sound_info
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from running_nodes import Peer, arguments, environment, until
+from started_nodes import Children
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import (

@@ -13,11 +13,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from children import Child, Children
 from hostile_messages import difference
 from rcl_interfaces.srv import GetParameters, SetParameters
 from rclpy.parameter import Parameter
 from running_nodes import BODIES, CAMERA, Peer, arguments, environment, until
+from started_nodes import Child, Children
 from std_srvs.srv import SetBool
 
 from sq_msgs_py.superquadrics import from_message

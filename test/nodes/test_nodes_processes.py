@@ -13,11 +13,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from children import Child, command
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from running_nodes import BODIES, CAMERA, PATIENCE, Peer, arguments, environment, nanoseconds, until
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from started_nodes import Child, command
 from std_srvs.srv import SetBool
 
 from sq_msgs_py.depth_image import depth_to_message
