@@ -11,7 +11,7 @@ are therefore sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.
 
 Planes are found by RANSAC on a seeded subsample and least squares on the inliers.  Of a share s of the points, n draws
 of three miss a plane with the probability (1 - s^3)^n: more are drawn where no large plane is found.  The table is the
-one with many points that lies low in the image and is not the face of a body.
+one with many points that lies low in the image, right below what is on no plane.
 
 Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981).
 """
@@ -26,7 +26,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
-from sq_perception.imaging import depth_steps, regions
+from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import coarse_grid
 from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
@@ -55,9 +55,6 @@ _PLANES = 3
 """A table, the floor below it and a wall behind it."""
 _APART = 2
 """Pixels next to a body that are none of its surroundings, as they may show either."""
-_ISLAND_SHARE = 0.25
-"""Share of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of
-it.  Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
 LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
 shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
@@ -70,25 +67,12 @@ _TYPICAL_HEIGHT, _FAR = 0.1, 0.1
 the middle of the image as a table is, but things are anywhere before it, not on it.  The square of the mean counts: of
 four recorded bins the bottom was chosen once without, always with it; simulated stools, boards and cartons gain.
 And that mean at least: where all is far from all planes, it says nothing."""
-_ASIDE, _ASIDE_SHARE = 0.7, 0.2
-"""Cosine between a normal and the image's rows from which on a plane is beside the camera, and the share of the points
-that it then needs.  The side of a shelf before a level camera had up to 0.18 in 15 recorded frames, and hid what stands
-there; before a camera turned by a right angle 6 of 360 tables are so small in the image."""
 _STRAY = 0.003
 """Share of the points that may be on no plane although nothing is there: of normal noise 0.3 % lies beyond three
 deviations, and tolerances are wider."""
 
-_LAYERS, _BESIDE = 3, 0.55
-"""Tolerances from a plane up to which points are counted on either side, and the most on both, over those on it.  Of
-133 recorded supports none has half as many on both sides, and noise as wide as the tolerance would leave a quarter; of
-planes through the heaps that fill two recorded bins both sides have six tenths and more.  So they have of one table, of
-which a near stereo camera makes waves of a centimetre: it is no support any more."""
-
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
-
-_Surface = tuple[np.ndarray, bool]
-"""Points (n, 3), and whether they are a small island before nothing: what may be a body seen face-on."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,12 +138,7 @@ def support(
     support begins right above it.  Of a table and the floor below it the table is the support, even if the image shows
     more of the floor; a plane no larger than a thing is such a table only if it has a good share of the floor's points.
 
-    No support is
-
-    - a plane with hardly anything close above it, such as a wall metres behind the table of a low camera;
-    - the face of a body, unless most of what lies on no plane is close above it;
-    - a plane through a heap, with as many points right above and right below it;
-    - a small plane beside the camera, such as the side of a shelf.
+    A plane with hardly anything close above it is none, such as a wall metres behind the table of a low camera.
 
     Parameters
     ----------
@@ -168,20 +147,13 @@ def support(
     depth, valid : (height, width)
         Metres, and where they are a measurement.
     """
-    surfaces = _on_one_surface(depth, valid, camera)
-    is_face = [_is_face(plane, surfaces) for plane in candidates]
-    if all(is_face):
+    if not candidates:
         return None
     points = _some_points(depth, valid, camera, _PLANE_POINTS)
     held, near, rest = _held(candidates, points)
-    bearing = [k for k, face in enumerate(is_face) if held[k] > 0.5 or not face]
-    votes = {candidates[k]: _vote(candidates[k]) * near[k] ** 2 for k in bearing if not _is_aside(candidates[k])}
-    if not votes:
-        return None
+    votes = {plane: _vote(plane) * share**2 for plane, share in zip(candidates, near, strict=True)}
     best = max(votes, key=votes.__getitem__)
     if rest > _STRAY and abs(best.equation[1]) < _FRONTAL and max(held) < _HELD_SHARE:
-        return None
-    if _is_amid(best, points):
         return None
 
     def is_thing(plane: Plane) -> bool:
@@ -319,32 +291,6 @@ def least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
 
 
-def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
-    """Whether most of a plane's points are on a small island before nothing: a body, seen face-on."""
-    on, alone = 0, False
-    for points, is_island in surfaces:
-        inside = int(np.count_nonzero(_lie_on(plane, points)))
-        if inside > on:
-            on, alone = inside, is_island
-    return alone
-
-
-def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:
-    """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
-    k = coarse_grid.stride(depth.shape)
-    coarse, kept = depth[::k, ::k], valid[::k, ::k]
-    jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
-    labels = depth_steps.components(kept & ~jumps)
-    extents, surfaces = regions.extents(labels), []
-    for label in np.flatnonzero(extents[:, 0] > 0.02 * extents[:, 0].sum()).tolist():
-        rows, columns = regions.pixels(labels, label, extents[label])
-        size, top, bottom, left, right = extents[label].tolist()
-        inside = min(top, left, labels.shape[0] - bottom, labels.shape[1] - right) > 0
-        points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
-        surfaces.append((points, inside and size < _ISLAND_SHARE * labels.size))
-    return surfaces
-
-
 def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
     """Points (n, 3) of a coarse image that lie on a plane, of the largest connected part: the tops of two cartons may
     lie in one plane."""
@@ -374,20 +320,6 @@ def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], lis
     held = np.mean((rest > 0) & (rest < _CLOSE), axis=1)
     near = np.mean(np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0), axis=1)
     return held.tolist(), np.maximum(near, _FAR).tolist(), rest.shape[1] / len(points)
-
-
-def _is_aside(plane: Plane) -> bool:
-    """Whether a plane is beside the camera, and too small to be a table before a turned one."""
-    return abs(plane.equation[0]) > _ASIDE and plane.share < _ASIDE_SHARE
-
-
-def _is_amid(plane: Plane, points: np.ndarray) -> bool:
-    """Whether right above a plane and right below it there are hardly fewer points (n, 3) than on it."""
-    height = plane.height(points) / (TOLERANCE * noise_growth(points[:, 2]))
-    near = np.abs(height) < _LAYERS
-    off = near & (np.abs(height) >= 1)
-    fewest = min(np.count_nonzero(off & (height > 0)), np.count_nonzero(off & (height < 0)))
-    return bool(fewest > _BESIDE * np.count_nonzero(near & ~off))
 
 
 def _vote(plane: Plane) -> float:

@@ -11,7 +11,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
-from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.segments import Segmentation, from_labels, segment, support_under
 from sq_perception.simulation import sensor_noise
@@ -239,40 +238,6 @@ def test_a_table_of_which_single_pixels_are_measured_holds_things_up(pitch):
     found = segment(depth, VGA)
     assert found.plane is not None
     assert min(best_iou(truth == k, found.labels) for k in (1, 2)) > 0.85
-
-
-def test_a_face_that_holds_more_than_a_wall_but_not_most_leaves_the_wall(monkeypatch):
-    wall, face = (
-        support_plane.Plane(np.array([0.0, 0.0, -1.0, d]), share, 1e-3) for d, share in ((2.0, 0.6), (1.0, 0.2))
-    )
-    monkeypatch.setattr(support_plane, "_is_face", lambda plane, _: plane is face)
-    monkeypatch.setattr(support_plane, "_held", lambda *_: ([0.0, 0.4], [1.0, 1.0], 0.5))
-    depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
-    assert support_plane.support([wall, face], depth, depth > 0, CAMERA) is wall
-
-
-@pytest.mark.parametrize(("thickness", "is_support"), [(1.5, True), (4.0, False)])
-def test_a_plane_amid_a_heap_is_no_support(rng, thickness, is_support):
-    """Points anywhere within so many tolerances above and below a plane that is looked at from straight above."""
-    plane = support_plane.Plane(np.array([0.0, 0.0, -1.0, 0.7]), 0.3, 0.005)
-    within = support_plane.TOLERANCE * support_plane.noise_growth(np.array(0.7))
-    depth = 0.7 + thickness * within * rng.uniform(-1, 1, (CAMERA.height, CAMERA.width))
-    found = support_plane.support([plane], depth, depth > 0, CAMERA)
-    assert (found is plane) == is_support
-
-
-@pytest.mark.parametrize(("rows", "is_support"), [(slice(0, 240, 3), False), (slice(0, 240), True)])
-def test_a_plane_beside_the_camera_is_a_support_only_if_it_is_much_of_the_image(rng, rows, is_support):
-    """The side of a shelf before a level camera, or a table before one turned by a right angle; a heap beside it."""
-    heap = np.kron(rng.uniform(0.45, 0.7, (24, 32)), np.ones((10, 10)))
-    side = np.full((240, 320), np.inf)
-    side[rows, :155] = 0.15 * CAMERA.fx / (CAMERA.cx - np.arange(155))
-    depth = np.where(np.isinf(side) & (np.arange(320) < 100), np.nan, np.minimum(side, heap)).astype(np.float32)
-    valid = np.isfinite(depth)
-    planes = support_plane.planes(depth, valid, CAMERA)
-    assert planes[0].equation[0] > 0.99
-    found = support_plane.support(planes, depth, valid, CAMERA)
-    assert (found is planes[0]) if is_support else (found is None or found.equation[0] < 0.7)
 
 
 def test_misuse_is_refused():
