@@ -296,7 +296,8 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
 
 
 def _some_points(wanted: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    return regions.some_points(*np.nonzero(wanted), depth, camera, _POINTS)
+    rows, columns = np.nonzero(wanted)
+    return regions.some_points(rows, columns, depth, camera, _POINTS)
 
 
 def _is_silhouette(valid: np.ndarray) -> bool:
