@@ -150,7 +150,7 @@ def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: i
         for part, new in ((known.translation, shown.translation), (known.size, shown.size))
     )
     rounds = largest * np.abs(known.shape[0] - shown.shape[k]).max()
-    rounds += largest * np.abs(known.taper[0] - shown.taper[k]).max()
+    rounds += largest * np.abs(np.asarray(known.taper)[0] - np.asarray(shown.taper)[k]).max()
     return bool(sum(moves) + rounds + reach * turn > _STEP)
 
 
@@ -193,7 +193,8 @@ def collision_objects(
             added.primitives, added.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
         else:
             vertices, faces = meshes[k]
-            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k], bodies.taper[k])
+            taper = np.asarray(bodies.taper)[k]
+            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k], taper)
             added.meshes, added.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
         objects.append(added)
     return objects
