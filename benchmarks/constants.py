@@ -130,7 +130,10 @@ def of_single_images() -> Measured:
     bodies = Superquadric.stack([fit.superquadric for fit in fits])
     iou = metrics.volume_iou(bodies, Superquadric.stack([body for body, _ in single_images()]))
     iou *= np.array([fit.status != Status.FAILED for fit in fits])
-    results = [fit.superquadric.to_flat().tobytes() + fit.covariance.tobytes() + fit.message.encode() for fit in fits]
+    found = [fit.superquadric.to_numbers() for fit in fits]
+    results = [
+        body.tobytes() + fit.covariance.tobytes() + fit.message.encode() for body, fit in zip(found, fits, strict=True)
+    ]
     return Measured(results, 100 * float(iou.mean()))
 
 
@@ -180,7 +183,8 @@ def of_tracked_frames() -> Measured:
             shown = seen[number:]  # in later passes some are missed for good
             followed = session.follow(shown, stamp, view.pose, camera=view.scene.camera, depth=view.depth)
             for one, truth in zip(followed, truths[number:], strict=True):
-                results.append(one.superquadric.to_flat().tobytes() + one.covariance.tobytes() + str(one.id).encode())
+                numbers = one.superquadric.to_numbers()
+                results.append(numbers.tobytes() + one.covariance.tobytes() + str(one.id).encode())
                 errors.append(np.abs(tracking.size_errors(one.superquadric, truth)[0]).mean())
             results.append(str(session.hidden).encode())
     return Measured(results, 100 * float(np.mean(errors)))

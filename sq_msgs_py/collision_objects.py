@@ -200,7 +200,8 @@ def collision_objects(
             added.primitives, added.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
         else:
             vertices, faces = meshes[k]
-            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k], bodies.taper[k])
+            taper = np.asarray(bodies.taper)[k]
+            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k], taper)
             added.meshes, added.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
         objects.append(added)
     return objects

@@ -8,13 +8,13 @@ A body may taper: in place of x and y stand x' = x / s(k_x) and y' = y / s(k_y),
 
     s(k) = (1 + k z/a3) / (1 + |k|),   for |z| <= a3
 
-so that a1 and a2 are the half sizes of its largest section.  Whoever leaves k aside gets a body that encloses it.
+so that a1 and a2 are the half sizes at its wide end.  Whoever leaves k aside gets a body that encloses it.
 
 Fields, version 1
 -----------------
 x y z           centre, metres, in the frame of the header
 qx qy qz qw     unit quaternion, body to header frame
-a1 a2 a3        HALF sizes along the body's x y z, metres; of its largest section where it tapers
+a1 a2 a3        HALF sizes along the body's x y z, metres; those at the wide end where it tapers
 e1 e2           exponents: e1 along z, e2 in the xy plane; 0.1 is a box, 1 an ellipsoid, 2 an octahedron
 score           0 to 1: agreement of the soft-rendered body with the image
 residual        root mean square distance of the seen points to the surface, metres

@@ -79,8 +79,9 @@ def _within(distances: np.ndarray, noise: float, typical: float) -> tuple[float,
 def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
     """Share (3,) of each full size of a single body that points (n, 3) span along its axis, 0 to 1."""
     low, high = span(points - body.translation, body.rotation_matrix.T).T
-    low, high = np.maximum(low, -body.size), np.minimum(high, body.size)
-    return np.clip((high - low) / (2 * body.size * (1 - 2 * OUTLIER_SHARE)), 0.0, 1.0)
+    half = body.untapered().size
+    low, high = np.maximum(low, -half), np.minimum(high, half)
+    return np.clip((high - low) / (2 * half * (1 - 2 * OUTLIER_SHARE)), 0.0, 1.0)
 
 
 def failed(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:

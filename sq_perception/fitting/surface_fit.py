@@ -288,7 +288,7 @@ def _checked_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadri
     for body in start if is_several else [start]:
         if not isinstance(body, Superquadric) or body.batch_shape:
             raise ValueError(f"start: expected 'auto' or single superquadrics, got {body!r}")
-        states.append(State.of(Superquadric.from_flat(np.asarray(body.to_flat(), dtype=float))))
+        states.append(State.of(Superquadric.from_flat(np.asarray(body.to_numbers(), dtype=float))))
     return states
 
 

@@ -472,7 +472,7 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
         middle = (low + high) / 2
         _, above = at(middle)
         low, high = xp.where(above > 0, low, middle), xp.where(above > 0, middle, high)
-    return xp.maximum(at((low + high) / 2)[0], xp.max(values, axis=-1))
+    return at((low + high) / 2)[0]
 
 
 def nested_norm(x: Array, y: Array, z: Array, e1: Array, e2: Array) -> Array:

@@ -227,12 +227,12 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
 def superquadrics(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, in its frame."""
     bodies = Superquadric(**{name: getattr(array, name).astype(float) for name in _OF_A_BODY})
-    return bodies.with_taper(array.taper.astype(float))
+    return bodies.with_taper(np.asarray(array.taper, float))
 
 
 def _in_own_frames(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, each in its own frame."""
-    return Superquadric.at_origin(array.size, array.shape).with_taper(array.taper.astype(float))
+    return Superquadric.at_origin(array.size, array.shape).with_taper(np.asarray(array.taper, float))
 
 
 def covariances(array: SuperquadricArray) -> np.ndarray:
