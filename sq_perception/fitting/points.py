@@ -146,7 +146,14 @@ def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarra
     back, the same ones each time.
     """
     if hasattr(thing, "vertices") and hasattr(thing, "faces"):
-        corners = np.asarray(thing.vertices, dtype=float)[np.asarray(thing.faces, dtype=int)]
+        vertices, faces = np.asarray(thing.vertices, dtype=float), np.asarray(thing.faces, dtype=int)
+        if (
+            faces.ndim != 2
+            or faces.shape[1] != 3
+            or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices))
+        ):
+            raise ValueError(f"mesh: expected faces (m, 3) of {len(vertices)} vertices, got shape {faces.shape}")
+        corners = vertices[faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = np.linalg.norm(across, axis=1)
         if not (area.size and np.isfinite(area).all() and area.sum() > 0):
@@ -165,7 +172,8 @@ def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarra
     normals = np.asarray(normals, dtype=float)
     if normals.shape != (len(there), 3):
         raise ValueError(f"normals: expected {len(there)} rows as of the points, got shape {normals.shape}")
-    return kept, normals[there]
+    is_known = np.isfinite(normals).all(axis=1, keepdims=True)
+    return kept, np.where(is_known, normals, 0.0)[there]
 
 
 def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper: bool) -> Mixture:
