@@ -246,7 +246,8 @@ def _means(rows: list[list[float]]) -> dict[str, float]:
 def as_page(results: dict[str, Any]) -> str:
     """The results in Markdown."""
     people = list(next(iter(results["singles"].values())))
-    lines = [f"IoU mean / minimum, % of {results['bodies']} bodies; ms of one processor, median.", ""]
+    about = f"IoU mean / minimum, % of {results['bodies']} bodies; ms of a processor, median; compare within the table."
+    lines = [about, ""]
     lines += ["| cloud | " + " | ".join(people) + " |", "| --- |" + " --- |" * len(people)]
     for name, row in results["singles"].items():
         cells = [f"{row[who]['mean']:.1f} / {row[who]['min']:.1f}, {row[who]['ms']:.0f} ms" for who in people]

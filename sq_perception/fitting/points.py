@@ -8,6 +8,8 @@ Nothing is drawn at random.
 The covariance is that of the same normal equations.  Readings of one part of a surface may err together, as where the
 thing is no superquadric: with S_b the sum of the weighted residuals in each of 42 directions from the centre, n_b their
 number, the variance is multiplied by the mean of S_b^2 / n_b, which is 1 for independent noise, where that is above 1.
+A point that may be an outlier, with the probability 1 - r, tells r (1 - (1 - r) d^2 / s^2) of what a sure one does
+(T. A. Louis, Finding the observed information matrix when using the EM algorithm, JRSS B 44(2), 1982).
 
 Reference: W. Liu, Y. Wu, S. Ruan, G. S. Chirikjian, Robust and Accurate Superquadric Recovery: a Probabilistic
 Approach, CVPR 2022.
@@ -289,7 +291,8 @@ def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) 
     none = Prior(np.full(BODY_LENGTH, -np.inf), np.full(BODY_LENGTH, np.inf), 0.0, 0.0)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     residual = point_cost.distances(surface.points, body, turn) / mixture.sigma
-    scaled = weight / mixture.sigma**2
+    known = weight * np.maximum(1.0 - (1.0 - weight) * residual**2, 0.0)  # less what the mixture hides
+    scaled = known / mixture.sigma**2
     point_cost.normal_equations(
         surface.points, np.zeros(len(weight)), np.zeros(len(weight)), scaled, body, turn, none, sums
     )
