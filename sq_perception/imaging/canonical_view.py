@@ -207,9 +207,8 @@ def from_mask(
     nearer = np.full(mask.shape, np.float32(-np.inf))
     if find_hidden:
         read = mask & np.isfinite(depth)
-        lost = _within_hull(read)
-        if missing_is_hidden:
-            lost = mask if (mask & ~read).any() else np.ones_like(mask)
+        is_drawn = missing_is_hidden and bool((mask & ~read).any())  # not made of readings
+        lost = mask if is_drawn else np.ones_like(mask) if missing_is_hidden else _within_hull(read)
         ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
         nearer = _nearer(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
