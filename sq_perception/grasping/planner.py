@@ -158,7 +158,7 @@ def warm_up() -> None:
     """Compile or load every kernel."""
     two = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])
     bodies = Superquadric(np.full((2, 3), 0.02), np.ones((2, 2)), two, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
-    camera = Camera(2, 2, 1.0, 1.0, 0.5, 0.5)
+    camera = Camera(2, 2, 2.0, 2.0, 0.5, 0.5)
     grasps(bodies, PANDA, around=Surroundings(points=two + 0.3, depth=np.ones((2, 2)), camera=camera))
 
 
