@@ -97,12 +97,12 @@ def test_a_box_is_itself(scenes: list[tabletop.Tabletop]) -> None:
     turn, place = scene.table, scene.table @ np.array([0, 0, 0.075]) + scene.placed[0].translation
     placed = tabletop.Placed(thing, "upright", turn, place, 1, 1000, 1000)
     body = Superquadric(edges[[2, 0, 1]] / 2, [0.02, 0.02], place, rotation.from_matrix(turn[:, [2, 0, 1]]))
-    answer = scene_verdict._answer(body, placed, scene)
+    answer = scene_verdict.answer(body, placed, scene)
     assert answer.iou > 0.995
     np.testing.assert_allclose(answer.edge_errors, 0, atol=1e-9)
     np.testing.assert_allclose(answer.excess, 0, atol=2e-3)
     longer = Superquadric(body.size * [1.1, 1, 1], body.shape, body.translation, body.rotation)
-    answer = scene_verdict._answer(longer, placed, scene)
+    answer = scene_verdict.answer(longer, placed, scene)
     assert answer.iou == pytest.approx(1 / 1.1, abs=0.005)
     np.testing.assert_allclose(answer.edge_errors, [0, 0, 0.015], atol=1e-9)
     assert answer.size_error == pytest.approx(0.005)
