@@ -91,11 +91,10 @@ RANGES = StageRanges()
 def temporal(frames: Sequence[np.ndarray], factor: float, threshold: float) -> np.ndarray:
     """The last of some frames of a still scene, filtered with the ``factor`` a and the ``threshold`` d per metre."""
     held = _inverse(frames[0])
-    for frame in frames[1:]:
-        new = _inverse(frame)
+    for new in map(_inverse, frames[1:]):
         close = np.abs(new - held) < threshold
         held = np.where(np.isnan(new) | close, np.where(close, held + factor * (new - held), held), new)
-    return _depth(held)
+    return _inverse(held)
 
 
 def decimated(depth: np.ndarray, times: int) -> np.ndarray:
@@ -103,8 +102,7 @@ def decimated(depth: np.ndarray, times: int) -> np.ndarray:
     height, width = depth.shape[0] // times, depth.shape[1] // times
     cells = depth[: times * height, : times * width].reshape(height, times, width, times).swapaxes(1, 2)
     ordered = np.sort(cells.reshape(height, width, times * times), axis=2)  # NaN last
-    count = np.count_nonzero(~np.isnan(ordered), axis=2)
-    middle = np.maximum(count - 1, 0) // 2
+    middle = np.maximum(np.count_nonzero(~np.isnan(ordered), axis=2) - 1, 0) // 2
     return np.take_along_axis(ordered, middle[..., None], axis=2)[..., 0]
 
 
@@ -122,7 +120,7 @@ def spatial(depth: np.ndarray, factor: float, threshold: float, rounds: int) -> 
         for _ in range(2):  # along the rows, then along the columns
             _smooth_rows(w, factor, threshold)
             w = np.ascontiguousarray(w.T)
-    return _depth(w)
+    return _inverse(w)
 
 
 def ring(depth: np.ndarray, outer: int, inner: int, share: float) -> np.ndarray:
@@ -190,28 +188,25 @@ def blocks(depth: np.ndarray, quantum: float) -> np.ndarray:
     0 in the image that is compressed, and known to be missing afterwards, as a mask goes with it.
     """
     height, width = depth.shape
-    missing = np.isnan(depth)
     w = np.nan_to_num(_inverse(depth), nan=0.0)
     w = np.pad(w, ((0, -height % _BLOCK), (0, -width % _BLOCK)), mode="edge")
-    i = np.arange(_BLOCK, dtype=np.float32)
-    steps = np.float32(quantum * _BLOCK) * (1 + i[:, None] + i)
+    steps = np.float32(quantum * _BLOCK) * (1 + np.add(*np.indices((_BLOCK, _BLOCK), np.float32)))
     for top in range(0, height, _BLOCK):
         for left in range(0, width, _BLOCK):
             block = np.s_[top : top + _BLOCK, left : left + _BLOCK]
             w[block] = cv2.idct(np.rint(cv2.dct(w[block]) / steps) * steps)
-    w = w[:height, :width]
-    return _depth(np.where(missing | (w < quantum), np.float32(np.nan), w))
+    w = np.where(w < quantum, np.float32(np.nan), w)[:height, :width]
+    return np.where(np.isnan(depth), np.float32(np.nan), _inverse(w))
 
 
 @dataclass(frozen=True)
 class Stages:
-    """What one camera does after its sensor; 0 or None for what it does not."""
+    """What one camera does after its sensor; 0 or None for what it does not.  Thresholds and quanta are per metre."""
 
     frames: int = 1
     decimation: int = 1
     factor: float = 1.0
     threshold: float = 0.0
-    """Per metre."""
     rounds: int = 0
     outer: int = 0
     inner: int = 0
@@ -219,20 +214,15 @@ class Stages:
     foot: bool = False
     filling: Filling | None = None
     beside: float = 0.0
-    """x of the sensor in the frame of the camera that its image is aligned to, metres."""
+    """x of the sensor in the frame of the camera that its image is aligned to, metres; ``focal`` its focal length over
+    that of this camera; whether ``whole`` pixels are drawn, or points."""
     focal: float = 1.0
-    """Focal length of the sensor over that of this camera."""
     whole: bool = False
-    """Whether whole pixels are drawn when images are aligned, or points."""
     slope: tuple[float, float] = (0.0, 0.0)
     bow: float = 0.0
     median: Literal[0, 3, 5] = 0
     step: float = 0.0
     quantum: float = 0.0
-
-    def of_still(self, frames: Sequence[np.ndarray]) -> np.ndarray:
-        """One image of the ``frames`` of a still scene."""
-        return temporal(frames, self.factor, self.threshold) if len(frames) > 1 else frames[0]
 
     def processed(self, depth: np.ndarray, thing: np.ndarray, camera: Camera) -> np.ndarray:
         """The depth after all stages that keep its camera; ``thing`` bool (height, width) is what a ring goes around,
@@ -286,11 +276,8 @@ def draw_stages(rng: np.random.Generator, ranges: StageRanges = RANGES) -> Stage
 
 
 def _inverse(depth: np.ndarray) -> np.ndarray:
+    """1 / z of z, and back."""
     return np.ascontiguousarray(1 / depth, dtype=np.float32)
-
-
-def _depth(w: np.ndarray) -> np.ndarray:
-    return np.asarray(1 / w, dtype=np.float32)
 
 
 def _known(depth: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.camera_stages import Stages
+from sq_perception.simulation.camera_stages import Stages, temporal
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 
 _SHINING = 0.08
@@ -55,7 +55,8 @@ def measured_by_any(
 ) -> np.ndarray:
     """What a camera of a random sensor and these stages reports of a true depth image."""
     sensor = draw_sensor(camera, rng)
-    measured = stages.of_still([sensor.measured(depth, camera, rng) for _ in range(stages.frames)])
+    frames = [sensor.measured(depth, camera, rng) for _ in range(stages.frames)]
+    measured = temporal(frames, stages.factor, stages.threshold) if len(frames) > 1 else frames[0]
     if rng.random() < 0.4:
         measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:

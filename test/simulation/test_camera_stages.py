@@ -150,7 +150,7 @@ def test_cameras_are_drawn_from_the_ranges_and_one_without_stages_changes_nothin
     assert {each.rounds for each in drawn} == set(range(RANGES.rounds[1] + 1))
     assert all(abs(each.beside) <= RANGES.baseline[1] for each in drawn)
     image, mask = plane(), np.zeros((60, 90), bool)
-    np.testing.assert_array_equal(Stages().processed(Stages().of_still([image]), mask, CAMERA), image)
+    np.testing.assert_array_equal(Stages().processed(image, mask, CAMERA), image)
     mask[20:40, 30:50] = True
     for each in drawn[:40]:
         found = each.processed(image, mask, CAMERA)
