@@ -380,7 +380,7 @@ class TestSoftRender:
         seen, shown = images[:, ::3, ::3].double(), rendered[:, ::3, ::3]
         expected = 1 - (seen - shown).abs().sum(dim=(1, 2)) / torch.maximum(seen, shown).sum(dim=(1, 2))
         for body, image, value in zip(bodies, images.numpy(), expected.tolist(), strict=True):
-            parameters = np.concatenate([body.size, body.shape, body.translation])
+            parameters = np.concatenate([body.size, body.shape, body.translation, body.taper])
             got = soft_agreement.agreement(image, 3, parameters, body.rotation_matrix, s, tau)
             assert got == pytest.approx(value, abs=1e-9)
 

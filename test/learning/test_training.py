@@ -23,6 +23,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
 from sq_perception.learning.fixed_set import Settings, generate
+from sq_perception.learning.mirror_images import predicted_both_ways
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig, cosine
 from sq_perception.learning.training_state import mixed_precision
@@ -326,7 +327,9 @@ class TestThesisSetting:
         model = checkpoint.load(tmp_path / "model.safetensors")
         # Pixels of both sizes lie at column / (n - 1); nearest neighbours make the small frame of the large one.
         chosen = np.rint(np.linspace(0, 255, 64)).astype(int)
-        expected = unit_cube.optical_from_cube(model.predict(frame[None][:, chosen][:, :, chosen]))[0]
+        expected = unit_cube.optical_from_cube(
+            predicted_both_ways(model.predict, frame[None][:, chosen][:, :, chosen])
+        )[0]
         assert volume_iou(body, expected) > 0.999
 
     def test_a_full_frame_has_no_perspective(self, tmp_path: Path) -> None:

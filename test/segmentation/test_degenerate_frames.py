@@ -261,7 +261,7 @@ def check(found: FrameRecovery, frame: Frame) -> None:
     assert found.labels.shape == frame.depth.shape
     assert found.message or found.bodies
     for body in found.bodies:
-        assert np.isfinite(body.superquadric.to_flat()).all()
+        assert np.isfinite(body.superquadric.to_numbers()).all()
         assert (body.superquadric.size > 0).all()
         assert 0 <= body.score <= 1
         assert body.status == Status.CONVERGED or body.message
@@ -332,7 +332,7 @@ def test_bits_that_are_no_depth_raise_nothing_and_make_no_infinite_body(
     depth = np.frombuffer(bits, np.float32).reshape(height, width)
     for labels in (None, np.ones(depth.shape, np.int32)):
         for body in recoverer.recover(depth, camera, labels).bodies:
-            assert np.isfinite(body.superquadric.to_flat()).all()
+            assert np.isfinite(body.superquadric.to_numbers()).all()
 
 
 def test_readings_that_no_sensor_makes_count_as_none(recoverer: Recoverer) -> None:
@@ -346,4 +346,4 @@ def test_readings_that_no_sensor_makes_count_as_none(recoverer: Recoverer) -> No
         for image in (np.where(holes, np.float32(np.nan), depth), wild)
     )
     assert found.pixels == known.pixels
-    np.testing.assert_array_equal(found.superquadric.to_flat(), known.superquadric.to_flat())
+    np.testing.assert_array_equal(found.superquadric.to_numbers(), known.superquadric.to_numbers())
