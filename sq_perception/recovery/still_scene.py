@@ -181,11 +181,12 @@ def follow(recoverer: Recoverer, readings: Readings, last: Reference | None) -> 
 
 
 def warm_up() -> None:
-    """Compile, or load from disk, every kernel by two images of two readings."""
-    old, near = np.full((2 * _BLOCK, 2 * _BLOCK), np.float32(1)), np.ones((2 * _BLOCK, 2 * _BLOCK), np.uint8)
-    change, _ = _changed(old, old, 2.0)
-    _in_noise_levels(change, old, old, 1e-3, 2.0)
-    _moments(near, 1e-3, change, old, old, old)
+    """Compile, or load from disk, every kernel by an image that is all one object and repeats itself."""
+    readings = np.ones((2 * _BLOCK, 2 * _BLOCK), np.float32)
+    shown = np.ones(readings.shape, np.int32)
+    extents(shown)
+    _compared(readings, readings, shown, 1e-3)
+    _moments(_around(shown == 1), 1e-3, np.zeros_like(readings), readings, readings, readings)
 
 
 def repeated(last: Reference, readings: Readings) -> Repeated:

@@ -44,7 +44,7 @@ from pathlib import Path
 from sq_perception.commands import doctor
 from sq_perception.geometry import kernels
 said = [doctor._kernels()[0]]
-kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0)
+kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0, 0.0, 0.0)
 said += [doctor._kernels()[0]]
 (file,) = Path(kernels.gauge.stats.cache_path).glob("*.gauge_*.nbi")
 os.utime(file, (0, 0))
