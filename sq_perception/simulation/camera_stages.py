@@ -58,7 +58,7 @@ class StageRanges:
     """f b, pixels times metres, by which steps are counted: 21 for a D435 at 848 x 480, 87 for a D455 at 1280 x 720."""
     ring: float = 0.45
     outer: tuple[int, int] = (1, 6)
-    """Pixels, at VGA 2 to 5 in recorded frames of an Xtion and a Kinect v1."""
+    """Pixels."""
     both_sides: float = 0.2
     """Share of the rings that cost the near side readings too.  What a second eye does not see, or a window mixes with
     what is nearer, is behind; mixed pixels of time of flight are on both sides."""
