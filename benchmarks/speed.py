@@ -28,9 +28,8 @@ import cProfile
 import pstats
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 from unittest import mock
 
@@ -45,7 +44,7 @@ from sq_perception.geometry import metrics
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import recoverer
 from sq_perception.recovery.options import Method, RecoveryOptions
-from sq_perception.recovery.recovery import FrameRecovery, timed
+from sq_perception.recovery.recovery import FrameRecovery
 
 STEPS, LENGTH = 300, 2000
 """Of the loop: as much interpreter as NumPy, some milliseconds."""
@@ -103,14 +102,6 @@ def classic(work: Work) -> None:
         chosen = np.linspace(0, len(rows) - 1, min(len(rows), 1000)).astype(int)
         rows, columns = rows[chosen], columns[chosen]
         solina_bajcsy.fit(work.camera.unproject(columns, rows, work.depth[rows, columns]))
-
-
-@contextmanager
-def by_processor(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
-    """The recoverer's stages by processor time."""
-    began = time.process_time()
-    yield
-    milliseconds[stage] = 1e3 * (time.process_time() - began)
 
 
 def measured(chain: recoverer.Recoverer, work: Work, repeats: int) -> dict[str, Any]:
@@ -181,7 +172,8 @@ def main() -> None:
     before = report.previous("speed", "rows")
     rows: dict[str, dict[str, Any]] = {}
     chain = recoverer.Recoverer(threads=1)
-    with mock.patch.object(recoverer, timed.__name__, by_processor):
+    by_processor = SimpleNamespace(perf_counter=time.process_time)
+    with mock.patch.object(recoverer, "time", by_processor):
         for work in works():
             chain.warm_up(work.camera)
             rows[work.name] = measured(chain, work, options.repeats)
