@@ -93,8 +93,7 @@ def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = Non
     if len(set(names)) != len(bodies):
         raise ValueError(f"names: expected {len(bodies)} different ones, got {names}")
     found = []
-    straight = getattr(bodies, "untapered", lambda: bodies)()  # encloses one that tapers
-    for name, body in zip(names, straight, strict=True):
+    for name, body in zip(names, bodies.untapered(), strict=True):  # which enclose those that taper
         turn = rotation.normalize(np.asarray(body.rotation, dtype=float))
         if meshes:
             vertices, faces = triangles(Superquadric.at_origin(body.size, body.shape), MARKER_RESOLUTION)

@@ -115,23 +115,37 @@ def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
     assert best_iou(truth == 2, found.labels) > 0.8
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("others", [(), ((40, 40), (280, 40), (40, 200), (280, 200))])
-def test_a_table_that_light_raises_all_around_a_box_is_support(seed, others):
-    """By 2 cm at the box, and less over the 7 cm beside it: as long as a board that leans, but all around.
+OTHERS = [(), ((40, 40), (280, 40), (40, 200), (280, 200))]
 
-    Other boxes, beside which it raises nothing, do not matter.
-    """
+
+def raised_around_a_box(seed, others):
+    """A table that light raises by 2 cm at a box, and less over the 7 cm beside it: as long as a board that leans, but
+    all around.  Other boxes, beside which it raises nothing, do not matter.  Returns depth and the boxes' labels."""
     table = plane_image(slanted(90), 0.8)
     v, u = np.indices(table.shape)
     away = np.maximum(np.abs(v - 120), np.abs(u - 160)) / CAMERA.fx * 0.8 - 0.04
     rise = np.clip(0.02 - np.tan(np.deg2rad(16)) * away, 0, 0.02)
     depth, truth = with_bodies(table - rise, [cube_on(table, *at, 0.04) for at in ((160, 120), *others)])
-    found = judged_by_network(noisy(depth, 1e-3, seed), CAMERA)
+    return noisy(depth, 1e-3, seed), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("others", OTHERS)
+def test_a_table_that_light_raises_all_around_a_box_is_less_likely_a_thing_than_any_box(seed, others):
+    depth, truth = raised_around_a_box(seed, others)
+    found = judged_by_network(depth, CAMERA)
     assert best_iou(truth == 1, found.labels) > 0.8
     things = {int(found.labels[truth == k].max()) for k in range(1, 2 + len(others))}
     likely = dict(zip(found.ids, found.objectness, strict=True))
     assert all(likely[label] < 0.8 < min(likely[thing] for thing in things) for label in set(likely) - things)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("others", OTHERS)
+@pytest.mark.xfail(reason="to the network of masks what light raises is a thing, if an unlikely one")
+def test_a_table_that_light_raises_all_around_a_box_is_support(seed, others):
+    depth, _ = raised_around_a_box(seed, others)
+    assert len(judged_by_network(depth, CAMERA).ids) == 1 + len(others)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -248,7 +262,7 @@ def test_a_table_larger_than_a_thing_is_the_support_however_much_floor_is_seen()
         depth, truth = floor.see([top, *things], 1e-3)
         assert 0.09 < np.mean(truth == 1) < 0.3
         found = segment(depth, VGA)
-        assert stands == 0 or min(best_iou(truth == k, found.labels) for k in (2, 3)) > 0.85
+        assert min(best_iou(truth == k, found.labels) for k in (2, 3)) > 0.85
         assert found.plane == pytest.approx(floor.plane - np.array([0, 0, 0, stands]), abs=0.01)
 
 
