@@ -19,7 +19,6 @@ _PACKAGE = Path(__file__).parents[1]
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "exr": ("OpenEXR",),
-    "cluster": ("distributed",),
     "train": ("torch",),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }

@@ -53,7 +53,6 @@ examples:
   sq-perception recover depth_*.png --camera-info 525,525,319.5,239.5 --csv out.csv --html out.html
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
   sq-perception recover thousand_frames/ --jobs 8 --jsonl out.jsonl    # again after Ctrl-C: goes on
-  sq-perception recover thousand_frames/ --cluster tcp://10.0.0.1:8786 --jsonl out.jsonl
   sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover left.npz right.npz --poses poses.txt --json scene.json
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
@@ -84,7 +83,7 @@ distortion:
 
 tracking:
   --track follows bodies over the frames of each bag and folder, for a camera that stands still (docs/tracking.md);
-  "track" has the numbers of all frames so far.  With --jobs or --cluster each frame is recovered for itself.
+  "track" has the numbers of all frames so far.  With --jobs each frame is recovered for itself.
 
 several cameras:
   --poses FILE takes all frames as views of one scene that rests, and prints at the end what they say together, in the
@@ -170,7 +169,6 @@ def main(arguments: Sequence[str]) -> int:
         metavar="N",
         help="frames at a time, in processes of one thread (1: one, its objects in threads)",
     )
-    add("--cluster", metavar="ADDRESS", help="a running Dask cluster whose workers have this package (extra 'cluster')")
     score = number("a score from 0 to 1", lambda value: 0 <= value <= 1)
     add("--min-score", type=score, default=0.0, metavar="S", help="leave out bodies with a lower score, 0 to 1")
     add("-q", "--quiet", action="store_true", help="no table and no summary; errors only")

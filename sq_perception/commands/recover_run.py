@@ -29,8 +29,6 @@ from sq_perception.recovery.still_scene import StillScene
 
 def run(options: argparse.Namespace) -> int:
     """What ``sq-perception recover`` does with these options; the exit code."""
-    if options.cluster and options.jobs > 1:
-        return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
         return misused("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
@@ -108,7 +106,7 @@ class RecoverRun:
             raise ValueError(problem)
         if options.method in NEEDS_NETWORK:
             checkpoint.check(options.model)
-        # First: nothing is begun with damaged weights, without the answer of a cluster, or before a Ctrl-C meanwhile.
+        # First: nothing is begun with damaged weights, or before a Ctrl-C meanwhile.
         self._executor = self._chosen_executor()
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
@@ -118,11 +116,9 @@ class RecoverRun:
         self._unreadable = 0
         self._said: dict[str, set[str]] = {}
 
-    def _chosen_executor(self) -> Recoverer | workers.Processes | workers.Cluster:
+    def _chosen_executor(self) -> Recoverer | workers.Processes:
         options = self._options
         setup = workers.Setup(options.model, self._settings)
-        if options.cluster:
-            return workers.Cluster(setup, options.cluster)
         if options.jobs > 1:
             return workers.Processes(setup, options.jobs)
         return Recoverer(options.model, method=options.method)
@@ -176,7 +172,7 @@ class RecoverRun:
     def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
         """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
         executor = self._executor
-        if isinstance(executor, workers.Processes | workers.Cluster):
+        if isinstance(executor, workers.Processes):
             works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
             yield from workers.recovered(works, executor)
             return

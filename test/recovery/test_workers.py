@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -118,40 +117,6 @@ def test_a_frame_at_which_processes_die_takes_no_other_with_it(monkeypatch: pyte
     lost = [key for key, answer in found if isinstance(answer, workers.WorkerLostError)]
     assert lost in ([], [2])  # it may have been answered before the first kill
     assert all(len(answer.bodies) == 1 for key, answer in found if key not in lost)
-
-
-def test_a_worker_of_a_cluster_that_is_killed_costs_no_frame_and_answers_none_twice() -> None:
-    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    frames = _frames(12)
-    alone = Recoverer(method="symmetry", threads=1)
-    with distributed.LocalCluster(2, threads_per_worker=2, dashboard_address=None, host="127.0.0.1") as cluster:
-        answers, keys = [], []
-        crew = workers.Cluster(_SETUP, cluster.scheduler_address)
-        for key, answer in workers.recovered([*frames[:3], (-1, None), *frames[3:]], crew):
-            keys.append(key)
-            answers += [] if key == -1 else [answer]
-            if key == 2:
-                os.kill(cluster.workers[0].pid, signal.SIGKILL)
-    assert keys == [0, 1, 2, -1, *range(3, 12)]
-    for (_, work), answer in zip(frames, answers, strict=True):
-        expected = alone.recover(work.depth, work.camera, work.labels, work.options)
-        mine, theirs = answer.bodies[0].superquadric, expected.bodies[0].superquadric
-        np.testing.assert_allclose(mine.to_flat(), theirs.to_flat(), rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("address", ["localhost", "http://localhost:8787", "localhost:eight"])
-def test_what_is_no_address_of_a_cluster_leaves_nothing_behind_that_would_hang(address: str) -> None:
-    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    before = threading.enumerate()
-    with pytest.raises(ValueError, match=r"port|scheme|invalid literal"):
-        workers.Cluster(_SETUP, address)
-    assert threading.enumerate() == before
-
-
-def test_without_its_extra_a_cluster_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ImportError, match=r"'distributed': pip install 'sq_perception\[cluster\]'"):
-        workers.Cluster(_SETUP, "tcp://127.0.0.1:8786")
 
 
 def _children() -> list[int]:
