@@ -45,13 +45,13 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-def failed(message: str) -> int:
+def fail(message: str) -> int:
     """Complain of something that could not be done; returns its exit code."""
     complain(message)
     return FAILURE
 
 
-def misused(message: str) -> int:
+def reject_usage(message: str) -> int:
     """Complain of wrong usage; returns its exit code."""
     complain(message)
     return USAGE

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from sq_perception.commands.console import SUCCESS, failed, parser, progress
+from sq_perception.commands.console import SUCCESS, fail, parser, progress
 
 _HELP = "Make a fixed set of images on disk.  The same command finishes a set and makes damaged parts again."
 _EPILOG = """\
@@ -46,7 +46,7 @@ def main(arguments: Sequence[str]) -> int:
             task = bar.add_task("drawing", total=settings.train + settings.test)
             generate(folder, settings, partial(bar.advance, task))
     except FixedSetError as error:
-        return failed(f"dataset: {error}")
+        return fail(f"dataset: {error}")
     size = sum(path.stat().st_size for path in folder.glob("*.safetensors"))
     print(f"{folder}: {settings.train} + {settings.test} images, {size / 1e6:.1f} MB, all checksums right")
     return SUCCESS

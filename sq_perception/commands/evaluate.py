@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, failed, folder, parser, progress
+from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, fail, folder, parser, progress
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
     for failure in failures:
         complain(failure)
     if not contestants:
-        return failed("nothing is left to evaluate")
+        return fail("nothing is left to evaluate")
     images = ThesisImages(max(count for _, count in contestants), options.seed)
     with progress() as bar:
         tasks = {contestant.name: bar.add_task(contestant.name, total=count) for contestant, count in contestants}

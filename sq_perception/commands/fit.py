@@ -15,9 +15,9 @@ from sq_perception.commands.console import (
     SUCCESS,
     at_least,
     complain,
-    misused,
     parser,
     positive,
+    reject_usage,
     text_target,
 )
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     options = command.parse_args(arguments)
     if options.no_taper and options.most > 1:
-        return misused("--no-taper: only with one body")
+        return reject_usage("--no-taper: only with one body")
     return _run(options)
 
 
@@ -65,11 +65,11 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.cloud_file import read_surface
 
     if options.json and Path(options.json).resolve() in {Path(name).resolve() for name in options.files}:
-        return misused(f"--json: {options.json} is read as well")
+        return reject_usage(f"--json: {options.json} is read as well")
     code, entries = SUCCESS, []
     for name in options.files:
         try:
-            entry = _fitted(name, read_surface(Path(name)), options)
+            entry = _fit(name, read_surface(Path(name)), options)
         except (UnpackingError, OSError, ValueError) as error:
             complain(f"{name}: {error}")
             code = FAILURE
@@ -89,7 +89,7 @@ def _run(options: argparse.Namespace) -> int:
     return code
 
 
-def _fitted(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]:
+def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]:
     from sq_perception.fitting.decomposition import Parts, decompose
     from sq_perception.fitting.fit import Fit
     from sq_perception.fitting.points import fit_points, surface_of

@@ -122,7 +122,8 @@ def main(arguments: Sequence[str]) -> int:
         metavar="X,Y,W,H",
         help="only this part of each image, in pixels, after distortion was undone",
     )
-    add("--masks", type=_existing, metavar="DIR", help="label images, one a frame: its name and .png, 0 is background")
+    masks = "label images NAME.png, 0 is background, or binary ones, NAME_000000.png ... (BOP)"
+    add("--masks", type=_existing, metavar="DIR", help=masks)
     add(
         "--distortion",
         choices=("auto", "apply", "ignore"),

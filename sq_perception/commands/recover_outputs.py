@@ -283,7 +283,7 @@ def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, opti
         covariances = np.array([body.covariance for body in bodies])
         stack = Superquadric.stack([body.superquadric for body in bodies])
         scene_export.write(
-            scene_export.grown(stack, covariances, options.inflate),
+            scene_export.inflate(stack, covariances, options.inflate),
             path,
             options.export,
             names=[f"body_{k}" for k in shown],

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from sq_perception.commands import console
-from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, failed, misused
+from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, fail, reject_usage
 from sq_perception.commands.recover_lines import lines, scene_lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
@@ -30,17 +30,17 @@ from sq_perception.recovery.still_scene import StillScene
 def run(options: argparse.Namespace) -> int:
     """What ``sq-perception recover`` does with these options; the exit code."""
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
-        return misused("--json, --jsonl, --csv: only one of them can be the standard output")
+        return reject_usage("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
-        return misused("--poses: expected a pinhole camera, and a method that says how sure it is: auto or symmetry")
+        return reject_usage("--poses: expected a pinhole camera, and a method with deviations: auto or symmetry")
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
     try:
         this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
-        return failed(str(error))
+        return fail(str(error))
     except ValueError as error:
-        return misused(str(error))
+        return reject_usage(str(error))
     code = this.over_all_frames()
     this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
@@ -107,7 +107,7 @@ class RecoverRun:
         if options.method in NEEDS_NETWORK:
             checkpoint.check(options.model)
         # First: nothing is begun with damaged weights, or before a Ctrl-C meanwhile.
-        self._executor = self._chosen_executor()
+        self._executor = self._make_executor()
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
         poses = CameraPoses(options.poses) if options.poses else None
@@ -116,7 +116,7 @@ class RecoverRun:
         self._unreadable = 0
         self._said: dict[str, set[str]] = {}
 
-    def _chosen_executor(self) -> Recoverer | workers.Processes:
+    def _make_executor(self) -> Recoverer | workers.Processes:
         options = self._options
         setup = workers.Setup(options.model, self._settings)
         if options.jobs > 1:
@@ -126,7 +126,7 @@ class RecoverRun:
     def over_all_frames(self) -> int:
         """Recover them; the exit code."""
         try:
-            for (file, frame), answer in self._answered(_progress(self._recorded)):
+            for (file, frame), answer in self._answer(_progress(self._recorded)):
                 try:
                     if isinstance(frame, FrameError):
                         raise frame
@@ -169,12 +169,12 @@ class RecoverRun:
         settings = replace(self._settings, free_space=frame.has_free_space)
         return workers.Work(frame.depth, frame.camera, frame.labels, settings)
 
-    def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
+    def _answer(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
         """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
         executor = self._executor
         if isinstance(executor, workers.Processes):
             works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
-            yield from workers.recovered(works, executor)
+            yield from workers.recover_all(works, executor)
             return
         scene = StillScene(executor)
         sequence, is_warm = ("", ""), False

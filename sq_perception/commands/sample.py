@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import SUCCESS, misused, parser, target
+from sq_perception.commands.console import SUCCESS, parser, reject_usage, target
 from sq_perception.files import output_file
 
 _HELP = """\
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str]) -> int:
     command.add_argument("output", type=target, metavar="FILE", help="an .npz")
     output = command.parse_args(arguments).output
     if output.suffix.lower() != ".npz":
-        return misused(f"{output}: expected a name that ends in .npz")
+        return reject_usage(f"{output}: expected a name that ends in .npz")
 
     import numpy as np
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, failed, parser, positive
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, fail, parser, positive
 from sq_perception.learning.training_config import MASK_RUN, THING_RUN, ShardTraining
 
 _DRAW = """\
@@ -107,7 +107,7 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
         with one_kernel_thread():  # a process a core draws
             write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
     except ValueError as error:
-        return failed(f"{name}: {error}")
+        return fail(f"{name}: {error}")
     return SUCCESS
 
 
@@ -139,7 +139,7 @@ def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
     try:
         train(subject, replace(run, **options), views, output)
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
-        return failed(f"train-{subject.name}: {error}")
+        return fail(f"train-{subject.name}: {error}")
     except KeyboardInterrupt:
         complain(f"train-{subject.name}: stopped; the same command goes on from the last validation")
         return INTERRUPTED

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from sq_perception.commands.console import INTERRUPTED, SUCCESS, failed, parser, progress
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, fail, parser, progress
 from sq_perception.learning import training_config
 from sq_perception.learning.training_config import CHOICES, TrainingConfig
 
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception train``; the exit code."""
     command = parser("train", _HELP, _EPILOG)
     command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
-    shipped = ", ".join(training_config.shipped())
+    shipped = ", ".join(training_config.shipped_names())
     command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
     for field in fields(TrainingConfig):
         name = "--" + field.name.replace("_", "-")
@@ -61,5 +61,5 @@ def main(arguments: Sequence[str]) -> int:
         print(stopped, file=sys.stderr)
         return INTERRUPTED
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
-        return failed(f"train: {error}")
+        return fail(f"train: {error}")
     return SUCCESS

@@ -25,7 +25,7 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
 
 
-def compiled(function: _F, options: dict[str, Any]) -> _F:
+def compile_kernel(function: _F, options: dict[str, Any]) -> _F:
     """numba's ``njit`` with these options, its machine code kept wherever there is a place."""
     settings: Any = numba.config
     named = settings.CACHE_DIR
@@ -34,7 +34,7 @@ def compiled(function: _F, options: dict[str, Any]) -> _F:
     except RuntimeError:  # numba knows no place
         kept = None
     if named and (kept is None or not Path(kept.stats.cache_path).is_relative_to(named)):
-        _passed_over(named)
+        _warn_unwritable(named)
     if kept is not None:
         return cast(_F, kept)
     folder = temporary_folder()
@@ -64,7 +64,7 @@ def _announce() -> None:
 
 
 @cache
-def _passed_over(named: str) -> None:
+def _warn_unwritable(named: str) -> None:
     """Warn once of a NUMBA_CACHE_DIR that cannot be written, as numba does not."""
     _log.warning(
         "NUMBA_CACHE_DIR: %s cannot be written: compiled kernels are kept elsewhere, `sq-perception doctor` says where",

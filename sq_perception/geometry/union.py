@@ -34,7 +34,7 @@ def flat_support(flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def moved(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+def move(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
     """Flat parameters (k, 12 or 14) after p -> R p + shift, the rotation given as a unit quaternion (4,)."""
     m = _matrix(rotation)
     out = flat.copy()

@@ -40,7 +40,7 @@ class Grasp:
     score: float
     weakest: str
 
-    def placed(self, points: np.ndarray) -> np.ndarray:
+    def to_body_frame(self, points: np.ndarray) -> np.ndarray:
         """Points (j, 3) of the TCP's frame in the frame of the bodies."""
         return points @ np.asarray(quaternions.to_matrix(self.rotation)).T + self.position
 

@@ -244,7 +244,7 @@ def _among_others(
 def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
     """Count sides and near ends only as far as the image does not show that they are empty; points tell the rest."""
     turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
-    hidden = around.hidden(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
+    hidden = around.hidden_share(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
     shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(log_phi(gap + PASSES, np.hypot(SIDE_SIGMA, placement)))
     trials.logs[:, 0] = np.log1p(hidden[:, :2] * np.expm1(trials.sides)).sum(axis=1) + np.log1p(shown)
     trials.logs[:, 2] = np.log1p(hidden[:, 2] * np.expm1(trials.logs[:, 2]))

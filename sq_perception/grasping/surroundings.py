@@ -91,7 +91,7 @@ class Surroundings:
         _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
         if len(kept) > _MOST:
             kept = kept[np.linspace(0, len(kept) - 1, _MOST).astype(int)]
-        return cls(plane, points[kept], perforation.filled(z)[0], camera)
+        return cls(plane, points[kept], perforation.fill(z)[0], camera)
 
     def down(self, places: np.ndarray) -> np.ndarray:
         """Unit vectors (k, 3) downwards at places (k, 3): onto the plane, without one away from the frame's origin."""
@@ -107,7 +107,7 @@ class Surroundings:
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
         return np.asarray(np.mean(self.beyond(places) < -_BEHIND, axis=1))
 
-    def hidden(self, places: np.ndarray) -> np.ndarray:
+    def hidden_share(self, places: np.ndarray) -> np.ndarray:
         """Share (...,) of places (..., j, 3) of which the image does not show that they are empty."""
         return np.asarray(np.mean(~(self.beyond(places) > _EMPTY), axis=-1))
 

@@ -87,7 +87,7 @@ def fills(mask_box: tuple[int, int, int, int], measured: np.ndarray) -> bool:
 
 
 @kernel
-def renumbered(labels: np.ndarray, number: np.ndarray) -> np.ndarray:
+def renumber(labels: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Labels int32 (height, width) with other ones in their place: ``number`` (count + 1,) gives that of each."""
     found = np.empty(labels.shape, np.int32)
     for v in range(labels.shape[0]):
@@ -150,7 +150,7 @@ def borders(
     return met + met.T, beside + beside.T, behind
 
 
-def enclosed(met: np.ndarray) -> np.ndarray:
+def find_enclosed(met: np.ndarray) -> np.ndarray:
     """Which labels (n,) are next to others nearly all around, hardly to 0, by their contacts."""
     return np.asarray(met[:, 0] < _OPEN * met.sum(axis=1))
 

@@ -107,7 +107,7 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 
-def moved_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
+def move_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
     """Images (n, p, p) in positions (n,)."""
     images = np.where(mirror[:, None, None], images[:, :, ::-1], images)
     out = np.empty_like(images)
@@ -117,7 +117,7 @@ def moved_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> n
     return out
 
 
-def moved_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
+def move_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
     """The bodies (n,) of those images."""
     sign = np.where(mirror, -1.0, 1.0)
     centred = bodies.translation - 0.5
@@ -128,12 +128,12 @@ def moved_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) ->
     return Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
 
 
-def turned_at_random(
+def turn_at_random(
     images: np.ndarray, bodies: Superquadric, rng: np.random.Generator
 ) -> tuple[np.ndarray, Superquadric]:
     """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
     turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
-    return moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+    return move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
 
 
 class ViewPool:
@@ -161,5 +161,5 @@ class ViewPool:
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
         bodies = Superquadric.from_flat(self._flat[chosen])
-        views, bodies = turned_at_random(self._images[chosen], bodies, self._rng)
-        return self._source.disturbance.applied(views, self._rng), bodies
+        views, bodies = turn_at_random(self._images[chosen], bodies, self._rng)
+        return self._source.disturbance.apply(views, self._rng), bodies

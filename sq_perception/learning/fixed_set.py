@@ -129,7 +129,7 @@ def generate(folder: Path, settings: Settings, progress: Callable[[int], None] =
     for split in SPLITS:
         for shard, (name, count) in enumerate(settings.shards(split).items()):
             if name not in done or _fault(folder / name, done[name]):
-                content = _packed(*draw(settings, split, shard, count))
+                content = _pack(*draw(settings, split, shard, count))
                 output_file.write(folder / name, content)
                 done[name] = hashlib.sha256(content).hexdigest()
                 _write_manifest(folder, settings, done)
@@ -192,12 +192,12 @@ class FixedSet:
         names = list(self._shards)
         for k, index in enumerate(chosen):
             name, within = names[index // SHARD], int(index % SHARD)
-            images, offset, bodies = self._opened(name)
+            images, offset, bodies = self._open_shard(name)
             grey[k] = cv2.imdecode(images[int(offset[within]) : int(offset[within + 1])], cv2.IMREAD_UNCHANGED)
             flat[k] = bodies[within]
         return self.settings.values(grey), Superquadric.from_flat(flat)
 
-    def _opened(self, name: str) -> tuple[Any, np.ndarray, np.ndarray]:
+    def _open_shard(self, name: str) -> tuple[Any, np.ndarray, np.ndarray]:
         """Images (bytes,), offsets and bodies of a shard."""
         if name not in self._open:
             path = self._folder / name
@@ -228,7 +228,7 @@ class ShuffledBatches:
         while len(self._order) < count:
             self._order = np.concatenate([self._order, self._rng.permutation(len(self._set))])
         chosen, self._order = self._order[:count], self._order[count:]
-        return dataset.turned_at_random(*self._set.batch(chosen), self._rng)
+        return dataset.turn_at_random(*self._set.batch(chosen), self._rng)
 
 
 def _write_manifest(folder: Path, settings: Settings, done: dict[str, str]) -> None:
@@ -240,7 +240,7 @@ def _flat(bodies: Superquadric) -> np.ndarray:
     return np.ascontiguousarray(bodies.to_flat(), dtype=np.float32)
 
 
-def _packed(images: np.ndarray, flat: np.ndarray) -> bytes:
+def _pack(images: np.ndarray, flat: np.ndarray) -> bytes:
     with ThreadPoolExecutor(thread_name_prefix="encode") as pool:
         encode = partial(cv2.imencode, ".png", params=[cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
         packed = [encoded.ravel() for _, encoded in pool.map(encode, images)]

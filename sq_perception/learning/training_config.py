@@ -65,7 +65,7 @@ class Plateau:
         """By which the learning rate is multiplied."""
         return _FACTOR**self.reductions
 
-    def validated(self, loss: float) -> None:
+    def record(self, loss: float) -> None:
         """Take note of a validation's loss."""
         if loss < self.best:
             self.best, self.without_progress = loss, 0
@@ -230,17 +230,17 @@ def read(path: str | Path, **changes: Any) -> TrainingConfig:
     return TrainingConfig(**{**_values(path), **changes})
 
 
-def shipped() -> list[str]:
+def shipped_names() -> list[str]:
     """Names of the configurations that travel with the package."""
     return sorted(path.stem for path in _SHIPPED.glob("*.yaml"))
 
 
 def _values(path: str | Path) -> dict[str, Any]:
     source = Path(path)
-    if str(path) in shipped():
+    if str(path) in shipped_names():
         source = _SHIPPED / f"{path}.yaml"
     if not source.is_file():
-        raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped())}")
+        raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped_names())}")
     try:
         values = plain_yaml.read(source) or {}
     except plain_yaml.YamlError as error:

@@ -114,7 +114,7 @@ class Engine:
     def build(self, parameters: RecoverParameters) -> None:
         """Make the recoverer and warm it up.  Raises ValueError if the model or the device cannot be used."""
         self.release()
-        self._built = _made(parameters, None, lambda: True)
+        self._built = _make(parameters, None, lambda: True)
 
     def release(self) -> None:
         """Let go of the recoverer, and of one that is being made."""
@@ -132,7 +132,7 @@ class Engine:
     def check(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
         """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that is known at once."""
         if "device" in changed:
-            inference.checked_device(parameters.device)
+            inference.check_device(parameters.device)
         reads = not changed.isdisjoint(_READ_BY)
         if self._built is not None and "method" in changed:
             reads = reads or not self._built.recoverer.has_weights
@@ -180,15 +180,15 @@ class Engine:
         """What is at work, for diagnostics."""
         if (built := self._built) is None:
             return "none"
-        return _described(built.parameters) + (", another one is being made" if self.is_making else "")
+        return _describe(built.parameters) + (", another one is being made" if self.is_making else "")
 
     def _swap(self, request: int, parameters: RecoverParameters, kept: _Built | None) -> None:
         started, log = perf_counter(), self._node.get_logger()
         built, fault = None, ""
         try:
-            built = _made(parameters, kept, lambda: request == self._request)
+            built = _make(parameters, kept, lambda: request == self._request)
         except Exception as error:  # whatever it is: the old one goes on
-            fault = f"cannot change to {_described(parameters)}: {' '.join(str(error).split())}"
+            fault = f"cannot change to {_describe(parameters)}: {' '.join(str(error).split())}"
         with self._lock:
             if request != self._request:  # another one is wanted by now
                 return
@@ -198,10 +198,10 @@ class Engine:
         if fault:
             log.error(f"{fault}; what was there before goes on")
         else:
-            log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
+            log.info(f"changed to {_describe(parameters)} within {perf_counter() - started:.1f} s")
 
 
-def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
+def _make(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
     """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if it is as good.
 
     None if nobody wants it any more.
@@ -239,7 +239,7 @@ def _file(model: str) -> Hashable:
     return str(path.resolve()), known.st_ino, known.st_size, known.st_mtime_ns
 
 
-def _described(parameters: RecoverParameters) -> str:
+def _describe(parameters: RecoverParameters) -> str:
     if parameters.method not in NEEDS_NETWORK:
         return f"method {parameters.method}, no network"
     return f"method {parameters.method}, {parameters.model or 'default weights'} on {parameters.device}"

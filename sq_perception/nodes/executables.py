@@ -117,11 +117,11 @@ def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
     if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 
-        return process.made(GraspNode, name)
+        return process.make(GraspNode, name)
     if name == "synthetic_depth_node":
         from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
 
-        return process.made(SyntheticDepthNode, name)
+        return process.make(SyntheticDepthNode, name)
     from sq_msgs_py.transforms import prefix_in
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
@@ -129,7 +129,7 @@ def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
     parameters = FitterParameters if name == "fitter_node" else RecoverParameters
     # Bodies of two cameras must not have one name.
     own = {} if namespace is None else {"tf_prefix": prefix_in(namespace)}
-    return process.made(FrameNode, name, parameters, namespace=namespace, defaults=own)
+    return process.make(FrameNode, name, parameters, namespace=namespace, defaults=own)
 
 
 def _namespace(text: str) -> str:

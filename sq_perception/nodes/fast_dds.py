@@ -56,10 +56,10 @@ def remove_orphans(folder: Path = FOLDER) -> tuple[str, ...]:
     except OSError:
         return ()
     found = (match for match in map(_LOCK.fullmatch, names) if match is not None)
-    return tuple(match[1] for match in found if _removed(folder / match[0], folder / match[1]))
+    return tuple(match[1] for match in found if _remove(folder / match[0], folder / match[1]))
 
 
-def _removed(lock: Path, segment: Path) -> bool:
+def _remove(lock: Path, segment: Path) -> bool:
     try:
         descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:

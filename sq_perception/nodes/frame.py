@@ -38,7 +38,7 @@ def newest() -> QoSProfile:
     return QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 
 
-def latched() -> QoSProfile:
+def latched_qos() -> QoSProfile:
     """Quality of service for what stays true: who subscribes later gets the last message.  Made anew, likewise."""
     return QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -77,7 +77,7 @@ class Frame:
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
             raise ValueError(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
-        return replace(self, labels=self.calibration.rectified_labels(labels))
+        return replace(self, labels=self.calibration.rectify_labels(labels))
 
     def encode(self, depth: np.ndarray) -> Image:
         """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
@@ -125,7 +125,7 @@ def decode(
         )
     found, encoding = publication.depth_of(message, False, scale)
     calibration = calibration_of()
-    depth = calibration.rectified(found.depth)
+    depth = calibration.rectify(found.depth)
     if kind == "range":
         depth = depth_units.z_from_range(depth, calibration.camera)
     return Frame(message.header, encoding, depth, calibration, notes=found.notes)
@@ -155,7 +155,7 @@ def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInf
         return None
     # Others on the topic may keep nothing; a plain subscription hears them.
     quietly = SubscriptionEventCallbacks(incompatible_qos=lambda _: None)
-    return node.create_subscription(CameraInfo, topic, callback, latched(), event_callbacks=quietly)
+    return node.create_subscription(CameraInfo, topic, callback, latched_qos(), event_callbacks=quietly)
 
 
 def stamp_of(message: Any) -> int:

@@ -195,11 +195,11 @@ class FrameNode(ManagedNode):
                 with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
-                    found = self._recovered(source, arrival) if arrival is not None and self._is_wanted() else None
+                    found = self._recover(source, arrival) if arrival is not None and self._is_wanted() else None
                 with self._publishing:
                     # Deactivated or disabled meanwhile: nothing is published.
                     if arrival and found and self._input is source and self._is_wanted():
-                        outcome = self._published(arrival, *found)
+                        outcome = self._publish(arrival, *found)
                         self._defects = 0
             except ValueError as error:
                 outcome = Outcome(False, str(error))
@@ -230,7 +230,7 @@ class FrameNode(ManagedNode):
         """Whether frames are processed, or one is asked for."""
         return self._enabled or any(not trigger.done() for trigger in tuple(self._triggers))
 
-    def _recovered(self, source: Input, arrival: Arrival) -> tuple[Frame, Answer, dict[str, float]]:
+    def _recover(self, source: Input, arrival: Arrival) -> tuple[Frame, Answer, dict[str, float]]:
         """The frame of an image, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
@@ -258,13 +258,13 @@ class FrameNode(ManagedNode):
                 turn, shift = pose_in(*asked, parameters.tf_tolerance)
         return tuple(turn.tolist()), tuple(shift.tolist())
 
-    def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
+    def _publish(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
         """Name the bodies and publish them; None where that is not wanted any more."""
         parameters = self._settings.current
         with timed(stages, "tracking"):
             found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
-            shown = self._outputs.shown(found, frame, parameters)
+            shown = self._outputs.shown_bodies(found, frame, parameters)
             # Both may have waited for transforms.  Disabled meanwhile: least of all a grasped body is published.
             if not self._is_wanted():
                 return None

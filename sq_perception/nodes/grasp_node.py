@@ -39,7 +39,7 @@ from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.nodes.frame import latched, stamp_of
+from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
@@ -90,7 +90,7 @@ class GraspNode(ManagedNode):
             self.create_publisher(PointCloud2, "~/grasp_details", 10),
             self.create_publisher(MarkerArray, "~/markers", 10),
         ]
-        self._planes = self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched())
+        self._planes = self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched_qos())
         self._heard_at = monotonic()
         self._clouds = Listener(self, PointCloud2, "superquadrics", self._on_cloud, self._statistics)
         self.get_logger().info(f"ready, listening to {self._clouds.topic}")
@@ -120,7 +120,7 @@ class GraspNode(ManagedNode):
         self._statistics.count("received")
         stages: dict[str, float] = {}
         with timed(stages, "plan"):
-            found, text = self._answered(message)
+            found, text = self._answer(message)
         if found is not None:
             self._statistics.answer(stages, text)
         elif self._clouds is None:
@@ -152,7 +152,7 @@ class GraspNode(ManagedNode):
 
     def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         cloud = self._last
-        found, response.message = self._planned_again(cloud)
+        found, response.message = self._plan_again(cloud)
         if found and cloud:
             response.success = True
             response.message = answers.text_of(found, cloud.header, response.message)
@@ -161,7 +161,7 @@ class GraspNode(ManagedNode):
     def _on_plan_grasps(self, request: Any, response: Any) -> Any:
         code, target, cloud = response.error_code, request.target.id, self._last
         code.source = self.get_fully_qualified_name()
-        found, code.message = self._planned_again(cloud)
+        found, code.message = self._plan_again(cloud)
         if found is None or cloud is None:
             code.val = code.FAILURE
             return response
@@ -180,13 +180,13 @@ class GraspNode(ManagedNode):
         code.val = code.SUCCESS if response.grasps else code.PLANNING_FAILED
         return response
 
-    def _planned_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
+    def _plan_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
         if not self.is_active or cloud is None:
             return None, "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
         age, limit = self._age(cloud), self._settings.current.max_age
         if 0 < limit < age:
             return None, f"the last superquadrics are {age:.1f} s old, and max_age is {limit:g} s"
-        found, text = self._answered(cloud)
+        found, text = self._answer(cloud)
         return found, f"{text}; {age:.1f} s old"
 
     def _plane_in(self, header: Any) -> np.ndarray | None:
@@ -194,27 +194,27 @@ class GraspNode(ManagedNode):
         plane = self._plane
         return plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
 
-    def _answered(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
+    def _answer(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
         """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
         try:
             if message.header.frame_id == CUBE_FRAME:
                 raise ValueError("views of the unit cube have no metres to grasp in")
             bodies = from_message(message).recovered
-            plan = planned(bodies, self._settings.current, self._plane_in(message.header))
+            planned = plan(bodies, self._settings.current, self._plane_in(message.header))
             with self._publishing:
                 if not self._outputs:  # deactivated while it was planned
                     return None, f"the node is {self.state}"
-                found = self._published(message.header, bodies, plan, gripper(self._settings.current.gripper))
+                found = self._publish(message.header, bodies, planned, gripper(self._settings.current.gripper))
         except Exception as error:
             reason = f"refused superquadrics: {type(error).__name__}: {error}"
             self.get_logger().warning(reason, throttle_duration_sec=THROTTLE)
             return None, reason
-        reasons = [f"{number}: {why}" for number, why in zip(bodies.id, plan.reasons, strict=True) if why]
+        reasons = [f"{number}: {why}" for number, why in zip(bodies.id, planned.reasons, strict=True) if why]
         if len(bodies) and not (reasons or len(found)):
             reasons = ["only_id and region leave none"]
         return found, "; ".join([f"{len(found)} grasps of {len(bodies)} bodies", *reasons])
 
-    def _published(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:
+    def _publish(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:
         found = messages.GraspArray(
             **{name: np.array([getattr(grasp, name) for grasp in plan.grasps]) for name in _OF_EACH_GRASP},
             id=np.array([bodies.id[grasp.body] for grasp in plan.grasps]),
@@ -226,16 +226,16 @@ class GraspNode(ManagedNode):
         meshes = []
         for grasp in best.values():
             vertices, faces, edges = hand.mesh(grasp.opening)
-            meshes.append((grasp.placed(vertices), faces, grasp.placed(edges)))
+            meshes.append((grasp.to_body_frame(vertices), faces, grasp.to_body_frame(edges)))
         shown.publish(self._markers(meshes, list(best), header))
         return found
 
     def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
         """Markers of grasps, by their bodies' ids, which replace the markers before."""
-        return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replaced(ids))
+        return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replace_markers(ids))
 
 
-def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
+def plan(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
     """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement

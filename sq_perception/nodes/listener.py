@@ -66,7 +66,7 @@ class Listener:
         self._subscriptions: list[Subscription] = []
         """The present one last; before it one that it replaces."""
         with self._lock:
-            self._subscribe(self._wanted_reliability())
+            self._subscribe(self._choose_reliability())
 
     @property
     def qos(self) -> QoSProfile:
@@ -102,12 +102,12 @@ class Listener:
             self._subscriptions = []
 
     def _follow_publishers(self) -> None:
-        wanted = self._wanted_reliability()
+        wanted = self._choose_reliability()
         with self._lock:
             if len(self._subscriptions) == 1 and wanted != self._qos.reliability:
                 self._subscribe(wanted)
 
-    def _wanted_reliability(self) -> QoSReliabilityPolicy:
+    def _choose_reliability(self) -> QoSReliabilityPolicy:
         if self._asked is not None:
             return self._asked
         offered = {one.qos_profile.reliability for one in self._node.get_publishers_info_by_topic(self.topic)}

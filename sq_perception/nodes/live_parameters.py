@@ -88,21 +88,21 @@ class LiveParameters(Generic[P]):
         self._kinds: dict[str, Any] = {parameter.name: type(parameter.default) for parameter in fields(kind)}
         self._fixed = {parameter.name for parameter in fields(kind) if not parameter.metadata["live"]}
         self._locked, self._check, self._changed, self._defaults = locked, check, changed, defaults
-        self.current: P = kind(**self._values([self._declared(node, parameter) for parameter in fields(kind)]))
+        self.current: P = kind(**self._values([self._declare(node, parameter) for parameter in fields(kind)]))
         """The values in force: an immutable set, replaced as a whole."""
-        node.add_pre_set_parameters_callback(lambda changes: [self._typed(change) for change in changes])
+        node.add_pre_set_parameters_callback(lambda changes: [self._cast(change) for change in changes])
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)
 
-    def _declared(self, node: Node, parameter: Field[Any]) -> Parameter:
+    def _declare(self, node: Node, parameter: Field[Any]) -> Parameter:
         # Of any type at first: declared as a double it would refuse an integer given at the start.
         default = self._defaults.get(parameter.name, parameter.default)
         node.declare_parameter(parameter.name, default, ParameterDescriptor(dynamic_typing=True))
-        given = self._typed(node.get_parameter(parameter.name))
+        given = self._cast(node.get_parameter(parameter.name))
         node.set_descriptor(parameter.name, describe(parameter, self._locked is None), given.get_parameter_value())
         return given
 
-    def _typed(self, given: Parameter) -> Parameter:
+    def _cast(self, given: Parameter) -> Parameter:
         """A parameter with integers as doubles where it is one, or a list of them."""
         kind = self._kinds.get(given.name)
         if kind is float and given.type_ == Parameter.Type.INTEGER:

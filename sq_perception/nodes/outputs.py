@@ -38,7 +38,7 @@ from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_message
 from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import transforms
-from sq_perception.nodes.frame import Frame, latched
+from sq_perception.nodes.frame import Frame, latched_qos
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
@@ -68,7 +68,7 @@ class MarkerIds:
         self._until: dict[int, float] = {}
         """Until when they are deleted, in the order in which they went; endless while they are shown."""
 
-    def replaced(self, ids: Sequence[int]) -> list[int]:
+    def replace_markers(self, ids: Sequence[int]) -> list[int]:
         """The ids whose markers the next message, which shows ``ids``, has to delete."""
         now, shown = monotonic(), dict.fromkeys(ids, math.inf)
         gone = {number: until for number, until in self._until.items() if until >= now and number not in shown}
@@ -97,7 +97,7 @@ class Outputs:
         self.superquadrics = create(PointCloud2, "~/superquadrics", 10)
         self.markers = create(MarkerArray, "~/markers", 1)
         self.rendered_depth = create(Image, "~/rendered_depth", 1)
-        self.support_plane = create(PoseStamped, "~/support_plane", latched())
+        self.support_plane = create(PoseStamped, "~/support_plane", latched_qos())
         self._publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane
         self.optional.follow(parameters)
 
@@ -115,9 +115,9 @@ class Outputs:
         """Delete the markers: nobody moves them from now on."""
         if self._header is not None and self._node.context.ok():
             header, self._header = self._header, None
-            self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replaced(())))
+            self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replace_markers(())))
 
-    def shown(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
+    def shown_bodies(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """What was found as every output shows it: in ``target_frame`` if there is one.
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
@@ -146,7 +146,7 @@ class Outputs:
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
-                    gone = self._marker_ids.replaced(shown.shown_ids)
+                    gone = self._marker_ids.replace_markers(shown.shown_ids)
                     self.markers.publish(shown.markers(gone, parameters.marker_alpha))
                     self._header = shown.header
                 if self.rendered_depth.get_subscription_count():
@@ -171,7 +171,7 @@ def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> 
 
 def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
     """Findings in another tf2 frame; as they are for an empty ``frame_id``.  Raises ValueError as :func:`pose_in`."""
-    return found.moved(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
+    return found.move(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 
 _KINDS = {

@@ -120,7 +120,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
     return code
 
 
-def made(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
+def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
     """A node of this class.
 
     Where it cannot be made, what is there of it is destroyed before the error goes on: the memory that it shares with

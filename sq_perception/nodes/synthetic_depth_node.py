@@ -29,7 +29,7 @@ from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings import camera_file, inputs
-from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
+from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generate, read, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
 from sq_perception.simulation.scenes import TABLE_CAMERA
 
@@ -48,10 +48,10 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
             camera_file.read_calibration(info, "ignore", size=inputs.ANY_SIZE)  # what is wrong with it is said at once
         paths = recordings(Path(parameters.path))
         with_labels = parameters.masks != "never"
-        count, make = len(paths), recorded(paths, info or None, parameters.projection, with_labels=with_labels)
+        count, make = len(paths), read(paths, info or None, parameters.projection, with_labels=with_labels)
     else:
         count = parameters.scenes
-        make = generated(
+        make = generate(
             parameters.scene,
             parameters.seed,
             objects=parameters.objects,

@@ -18,7 +18,7 @@ from rclpy.time import Time
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings.publication import Identified, identified
+from sq_perception.recordings.publication import Identified, identify
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally, TrackingSession
 
@@ -130,7 +130,7 @@ class Tracking:
         """
         if not parameters.tracking:
             self._session.reset()
-            return identified(recovery)
+            return identify(recovery)
         if self._origin not in (None, origin):
             self._forget("bodies come from another method or model from now on")
         self._origin = origin
@@ -151,7 +151,7 @@ class Tracking:
             raise ValueError(f"tracking: {error}") from error
         if self._session.tally.resets > resets:
             self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
-        return identified(recovery, tracks, self._session.hidden)
+        return identify(recovery, tracks, self._session.hidden)
 
     def _camera_pose(self, frame: Frame, parameters: RecoverParameters) -> tuple[Pose | None, bool]:
         """The camera's pose in ``fixed_frame``, None without such a frame, and False where it is not known."""

@@ -143,7 +143,7 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
         raise UnpackingError(expected)
     x, y, z = points[near].astype(float).T
     tangents = np.stack([x / z, y / z], axis=1)
-    if (layered := _layered(tangents, z)) > _MOST_LAYERED:
+    if (layered := _is_layered(tangents, z)) > _MOST_LAYERED:
         raise UnpackingError(
             f"{layered:.0%} of the points lie before or behind others, as in the cloud of a whole object and not in "
             "that of one camera: sq-perception fit takes clouds of whole objects"
@@ -151,7 +151,7 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     return (*_seen(tangents, z), False)
 
 
-def _layered(tangents: np.ndarray, z: np.ndarray) -> float:
+def _is_layered(tangents: np.ndarray, z: np.ndarray) -> float:
     """The share of points whose neighbours in the image lie on no common plane: those of a front and a back."""
     from scipy.spatial import cKDTree
 

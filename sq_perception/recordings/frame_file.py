@@ -33,12 +33,12 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from sq_perception.files.unpacking import UnpackingError, exr_image, grey_image, npy_array, npz_arrays
+from sq_perception.files.unpacking import exr_image, grey_image, npy_array, npz_arrays
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.imaging.depth_units import MILLIMETRES, DepthKind, Metres, Stated
-from sq_perception.recordings import cloud_file
+from sq_perception.recordings import cloud_file, mask_file
 from sq_perception.recordings.camera_file import FrameError, calibration, camera_beside, read_camera_info
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
@@ -119,7 +119,7 @@ class Reading:
     region : (4,) of int or None
         Left column, top row, width and height of the part to look at, pixels of the rectified image.
     masks : Path or None
-        A folder with a label image for each frame, of its name and ``.png``: 0 is background.
+        A folder with the masks of each frame, by its name (:mod:`sq_perception.recordings.mask_file`).
     ignore_masks : bool
         Whether no labels are read, wherever they are.
     kind : str
@@ -163,16 +163,15 @@ class Reading:
         """
         if self.masks is None or self.ignore_masks:
             return None
-        path = self.masks / f"{name}.png"
-        if not path.is_file():
-            raise FrameError(f"{path}: no such mask")
         try:
-            labels = grey_image(path)
-        except UnpackingError as error:
-            raise FrameError(f"{path}: {error}") from error
+            labels = mask_file.read(self.masks, name)
+        except ValueError as error:
+            raise FrameError(str(error)) from error
         if labels.shape != like.shape:
-            raise FrameError(f"{path}: expected labels of the depth's shape {like.shape}, got {labels.shape}")
-        return labels.astype(np.int32)
+            raise FrameError(
+                f"{self.masks / name}: expected labels of the depth's shape {like.shape}, got {labels.shape}"
+            )
+        return labels
 
     def of(self, frame: RecordedFrame) -> RecordedFrame:
         """The frame within the limits, with a warning where it seems to be another kind of image.
@@ -297,8 +296,8 @@ def _of_pinhole(
     if not (-1 < camera.cx < camera.width and -1 < camera.cy < camera.height):
         middle, shape = f"{camera.cx:g}, {camera.cy:g}", f"{camera.width} x {camera.height}"
         warnings.append(f"{camera_info}: the middle {middle} is beside an image of {shape}: another resolution's?")
-    depth, labels = reading.z(way.rectified(found.depth), camera), reading.labels(path.stem, image)
-    labels = None if labels is None else way.rectified_labels(labels)
+    depth, labels = reading.z(way.rectify(found.depth), camera), reading.labels(path.stem, image)
+    labels = None if labels is None else way.rectify_labels(labels)
     encoding = "16UC1" if found.scale == MILLIMETRES and image.dtype == np.uint16 and reading.kind == "z" else "32FC1"
     return RecordedFrame(
         depth, camera, labels, path.name, warning="; ".join(warnings), notes="; ".join(found.notes), encoding=encoding
@@ -368,7 +367,7 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     except (ValueError, TypeError) as error:
         raise ValueError(f"K: {error}") from error
     unit = fields.get("depth_scale")
-    known = None if unit is None else depth_units.stated(float(unit), "depth_scale")
+    known = None if unit is None else depth_units.parse_scale(float(unit), "depth_scale")
     found = _metres(depth, reading, known)
     return RecordedFrame(
         reading.z(found.depth, camera), camera, labels, path.name, notes="; ".join(found.notes), encoding="32FC1"

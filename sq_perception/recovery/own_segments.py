@@ -339,7 +339,7 @@ def _unclaimed(labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> t
     """
     nothing = np.ones(int(labels.max()) + 1, np.int32)
     nothing[[0, *kept]] = 0
-    free = regions.renumbered(labels, nothing).astype(np.uint8) | strays.view(np.uint8)
+    free = regions.renumber(labels, nothing).astype(np.uint8) | strays.view(np.uint8)
     left, top, width, height = cv2.boundingRect(free)
     reach = len(_BRUSH)
     window = slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)

@@ -67,7 +67,7 @@ class WorkerLostError(RuntimeError):
     """The processes that worked on a frame died, again and again."""
 
 
-def recovered(
+def recover_all(
     frames: Iterable[tuple[_Key, Work | None]], executor: Processes
 ) -> Iterator[tuple[_Key, FrameRecovery | Exception | None]]:
     """The key of each frame, in their order, with its recovery or the exception that it raised, None for no work.
@@ -88,7 +88,7 @@ def recovered(
         deaths = 0
         while True:
             try:
-                return key, _unpacked(answer.result())
+                return key, _unpack(answer.result())
             except _LostError:
                 deaths += 1
                 if deaths == TRIES:
@@ -137,7 +137,7 @@ class Processes:
             if self._ended:
                 raise _LostError
             if thread not in self._of_thread:
-                self._of_thread[thread] = _started(self._setup)
+                self._of_thread[thread] = _start(self._setup)
             process, pipe = self._of_thread[thread]
         try:
             pipe.send(work)
@@ -153,7 +153,7 @@ class Processes:
         return cast(FrameRecovery, answer)
 
 
-def _started(setup: Setup) -> tuple[BaseProcess, Connection]:
+def _start(setup: Setup) -> tuple[BaseProcess, Connection]:
     """A process, and this end of its pipe; Ctrl-C is for the one that asks."""
     # Not forked: a process that has threads of BLAS and numba cannot be copied.
     context = multiprocessing.get_context("spawn")
@@ -194,14 +194,14 @@ def _recoverer(setup: Setup) -> Recoverer:
 
 
 def _recover(setup: Setup, work: Work) -> FrameRecovery:
-    return _packed(_recoverer(setup).recover(work.depth, work.camera, work.labels, work.options))
+    return _pack(_recoverer(setup).recover(work.depth, work.camera, work.labels, work.options))
 
 
-def _packed(found: FrameRecovery) -> FrameRecovery:
+def _pack(found: FrameRecovery) -> FrameRecovery:
     """A recovery as it is sent: labels in as few bytes as they need."""
     labels = found.labels.astype(np.min_scalar_type(found.labels.max(initial=0)))
     return replace(found, labels=labels)
 
 
-def _unpacked(found: FrameRecovery | None) -> FrameRecovery | None:
+def _unpack(found: FrameRecovery | None) -> FrameRecovery | None:
     return None if found is None else replace(found, labels=found.labels.astype(np.int32))

@@ -99,7 +99,7 @@ def corrected(
         group = convex_pieces.linked(crossed, np.array([len(part.z) for part in parts], float), AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
-    return regions.renumbered(image.labels, number_of)
+    return regions.renumber(image.labels, number_of)
 
 
 def continued(
@@ -210,7 +210,7 @@ def _crossed_between(
         vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
         crossed[np.ix_(vessel, vessel)] = 0.0
     # The bottom of a vessel is seen over its wall alone: no line tells it from the bottom of the next one.
-    is_enclosed = regions.enclosed(borders[0])[names]
+    is_enclosed = regions.find_enclosed(borders[0])[names]
     crossed[(is_enclosed[:, None] | is_enclosed) & (met == 0)] = np.inf
     return crossed
 

@@ -18,7 +18,7 @@ from sq_perception.simulation.thing import (
     Row,
     Thing,
     about,
-    assembled,
+    assemble,
     log_uniform,
     part,
 )
@@ -56,7 +56,7 @@ def bottle(rng: np.random.Generator) -> Thing:
     rows += _closure(rng, a, b, straight, height)
     if oval and height > 0.16 and rng.random() < 0.18:
         rows += _grip(rng, a, straight, height)
-    return assembled("bottle", "oval bottle" if flat < 1 else "round bottle", rows, OVAL_RESTS if oval else ROUND_RESTS)
+    return assemble("bottle", "oval bottle" if flat < 1 else "round bottle", rows, OVAL_RESTS if oval else ROUND_RESTS)
 
 
 def _shoulders(rng: np.random.Generator, a: float, b: float, e2: float, low: float, high: float) -> list[Row]:
@@ -146,10 +146,10 @@ def tube(rng: np.random.Generator) -> Thing:
     ]
     cap, tall = radius * rng.uniform(0.55, 1.0), rng.uniform(0.01, 0.03)
     rows.append(part((cap, cap, tall / 2), (0.15, 1.0), (0, 0, -tall / 2)))
-    return assembled("bottle", "tube", rows, (("lying", ON_Y, 0.75), ("standing", UPRIGHT, 0.25)))
+    return assemble("bottle", "tube", rows, (("lying", ON_Y, 0.75), ("standing", UPRIGHT, 0.25)))
 
 
-def _revolved(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
+def _revolve(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
     """A stack of slabs with these radii from the base to the top."""
     count = len(radii)
     return [
@@ -186,7 +186,7 @@ def cup(rng: np.random.Generator) -> Thing:
     wall = rng.uniform(0.002, 0.006)
     count = 1 if bottom == top else 6
     radii = np.linspace(bottom, top, count + 2)[1:-1]
-    rows = _revolved(radii, height)
+    rows = _revolve(radii, height)
     cut = _cavity(radii, height, wall)
     name = "cup"
     if rng.random() < 0.55:
@@ -200,7 +200,7 @@ def cup(rng: np.random.Generator) -> Thing:
             slope = np.rad2deg(np.arctan2(out * s, tall * c))
             rows.append(part((thick * 0.8, thick, along), (0.6, 0.8), where, about(1, -slope)))
     rests = (("standing", UPRIGHT, 0.8), ("lying", ON_X if name == "cup" else ON_Y, 0.12), ("inverted", INVERTED, 0.08))
-    return assembled("vessel", name, rows, rests, cut)
+    return assemble("vessel", name, rows, rests, cut)
 
 
 def bowl(rng: np.random.Generator) -> Thing:
@@ -211,9 +211,9 @@ def bowl(rng: np.random.Generator) -> Thing:
     count = 4 if height < 0.03 else 8
     share = (np.arange(count) + 0.75) / count
     radii = foot + (top - foot) * share ** rng.uniform(0.4, 0.9)
-    rows = _revolved(radii, height)
+    rows = _revolve(radii, height)
     cut = _cavity(radii, height, rng.uniform(0.003, 0.006))
-    return assembled("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
+    return assemble("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
 
 
 def tub(rng: np.random.Generator) -> Thing:
@@ -222,7 +222,7 @@ def tub(rng: np.random.Generator) -> Thing:
     bottom = top * rng.uniform(0.7, 1.0)
     e2, flat = (1.0, 1.0) if rng.random() < 0.6 else (rng.uniform(0.15, 0.6), rng.uniform(0.55, 1.0))
     radii = np.linspace(bottom, top, 6)[1:-1]
-    rows = _revolved(radii, height, e2, flat)
+    rows = _revolve(radii, height, e2, flat)
     lid = rng.uniform(0.003, 0.01)
     cut: list[Row] = []
     if rng.random() < 0.7:
@@ -230,4 +230,4 @@ def tub(rng: np.random.Generator) -> Thing:
     else:
         cut = _cavity(radii, height, 0.004, e2, flat)
     rests = (("standing", UPRIGHT, 0.85), ("inverted", INVERTED, 0.08), ("on its side", ON_Y, 0.07))
-    return assembled("vessel", "tub", rows, rests, cut)
+    return assemble("vessel", "tub", rows, rests, cut)

@@ -159,13 +159,13 @@ def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TA
     kind = _KINDS[name]
     for _ in range(_TRIES):
         scene = things_on_table(rng, int(rng.integers(1, kind.most + 1)), camera, kind.elevation)
-        seen = _furnished(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng), kind.is_thing)
+        seen = _furnish(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng), kind.is_thing)
         if seen.placed:
             return seen
     raise ValueError(f"things in {name}: none is in sight")
 
 
-def _furnished(scene: ThingsOnTable, parts: list[Superquadric], down: float, is_thing: bool) -> ThingsOnTable:
+def _furnish(scene: ThingsOnTable, parts: list[Superquadric], down: float, is_thing: bool) -> ThingsOnTable:
     furniture, _ = raycast.render(Superquadric.stack(parts), scene.camera)
     beyond = np.minimum(plane_depth(scene.plane + np.array([0, 0, 0, down]), scene.camera), scene.wall)
     behind = np.minimum(furniture, beyond)

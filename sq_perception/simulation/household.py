@@ -36,7 +36,7 @@ from sq_perception.simulation.thing import (
     UPRIGHT,
     Thing,
     about,
-    assembled,
+    assemble,
     log_uniform,
     one_of,
     part,
@@ -69,7 +69,7 @@ def _carton(rng: np.random.Generator) -> Thing:
     if rng.random() < 0.4:
         edges = edges[rng.permutation(3)]
     soft = 0.03 + 0.3 * rng.random(2) ** 2
-    return assembled("box", "carton", [part(edges / 2, soft)], CARTON_RESTS)
+    return assemble("box", "carton", [part(edges / 2, soft)], CARTON_RESTS)
 
 
 def _book(rng: np.random.Generator) -> Thing:
@@ -77,7 +77,7 @@ def _book(rng: np.random.Generator) -> Thing:
     height = rng.choice([0.297, 0.21, 0.148, 0.25]) * rng.uniform(0.9, 1.1)
     size = np.array([rng.uniform(0.005, 0.05), height * rng.uniform(0.6, 0.8), height]) / 2
     rests = (("flat", ON_X, 0.8), ("standing", UPRIGHT, 0.2))
-    return assembled("box", "book", [part(size, rng.uniform(0.02, 0.1, 2))], rests)
+    return assemble("box", "book", [part(size, rng.uniform(0.02, 0.1, 2))], rests)
 
 
 def _soap(rng: np.random.Generator) -> Thing:
@@ -85,7 +85,7 @@ def _soap(rng: np.random.Generator) -> Thing:
     longest = log_uniform(rng, 0.03, 0.14)
     edges = longest * np.array([rng.uniform(0.2, 0.7), rng.uniform(0.4, 1.0), 1.0])
     shape = rng.uniform(0.1, 0.5, 2)
-    return assembled("box", "bar", [part(edges / 2, shape)], (("flat", ON_X, 0.6), *CARTON_RESTS))
+    return assemble("box", "bar", [part(edges / 2, shape)], (("flat", ON_X, 0.6), *CARTON_RESTS))
 
 
 def _tin(rng: np.random.Generator) -> Thing:
@@ -108,7 +108,7 @@ def _tin(rng: np.random.Generator) -> Thing:
         for inner, z in ((end, top), (radius, -height / 2)):
             inner -= rng.uniform(0.0015, 0.0035)
             cut.append(part((inner, inner, rng.uniform(0.003, 0.007)), (0.1, 1.0), (0, 0, z)))
-    return assembled("can", "tin", rows, ROUND_RESTS, cut)
+    return assemble("can", "tin", rows, ROUND_RESTS, cut)
 
 
 def _spray_can(rng: np.random.Generator) -> Thing:
@@ -121,7 +121,7 @@ def _spray_can(rng: np.random.Generator) -> Thing:
         part((0.97 * radius, 0.97 * radius, dome), (rng.uniform(0.6, 1.0), 1.0), (0, 0, height / 2)),
         part((cap, cap, tall / 2), (rng.uniform(0.08, 0.5), 1.0), (0, 0, height / 2 + 0.6 * dome + 0.3 * tall)),
     ]
-    return assembled("can", "spray can", rows, ROUND_RESTS)
+    return assemble("can", "spray can", rows, ROUND_RESTS)
 
 
 def _jar(rng: np.random.Generator) -> Thing:
@@ -135,7 +135,7 @@ def _jar(rng: np.random.Generator) -> Thing:
         part((radius, radius, height / 2), (rng.uniform(0.1, 0.45), e2)),
         part((lid, lid, tall / 2), (rng.uniform(0.05, 0.25), 1.0), (0, 0, height / 2 + tall * rng.uniform(0.2, 0.48))),
     ]
-    return assembled("can", "jar", rows, ROUND_RESTS)
+    return assemble("can", "jar", rows, ROUND_RESTS)
 
 
 def _roll(rng: np.random.Generator) -> Thing:
@@ -147,7 +147,7 @@ def _roll(rng: np.random.Generator) -> Thing:
     else:
         radius, height = rng.uniform(0.03, 0.07) / 2, rng.uniform(0.12, 0.32)
     rests = (("standing", UPRIGHT, 0.5), ("lying", ON_Y, 0.5))
-    return assembled("can", "roll", [part((radius, radius, height / 2), (rng.uniform(0.03, 0.3), 1.0))], rests)
+    return assemble("can", "roll", [part((radius, radius, height / 2), (rng.uniform(0.03, 0.3), 1.0))], rests)
 
 
 def _fruit(rng: np.random.Generator) -> Thing:
@@ -161,10 +161,10 @@ def _fruit(rng: np.random.Generator) -> Thing:
     elif choice < 0.35:  # the tips of a lemon
         rows.append(part((0.3 * radius, 0.3 * radius, 1.2 * size[2]), (0.9, 1.0)))
     rests = (("standing", UPRIGHT, 0.5), ("lying", ON_X, 0.25), ("on its side", ON_Y, 0.25))
-    return assembled("round", "fruit", rows, rests)
+    return assemble("round", "fruit", rows, rests)
 
 
-def _bent(rng: np.random.Generator) -> Thing:
+def _bend(rng: np.random.Generator) -> Thing:
     """Bananas and other bent things: an arc of ellipsoids in the xz plane; they lie on a side."""
     thick, bend = rng.uniform(0.028, 0.045) / 2, np.deg2rad(rng.uniform(40, 110))
     long = rng.uniform(0.12, 0.2)
@@ -174,7 +174,7 @@ def _bent(rng: np.random.Generator) -> Thing:
         r = thick * (1 - 0.45 * (2 * angle / bend) ** 2)
         where = (radius * (np.cos(angle) - 1), 0.0, radius * np.sin(angle))
         rows.append(part((r, r, 0.75 * long / steps), (0.8, 1.0), where, about(1, -np.rad2deg(angle))))
-    return assembled("round", "bent fruit", rows, (("lying", ON_Y, 1.0),))
+    return assemble("round", "bent fruit", rows, (("lying", ON_Y, 1.0),))
 
 
 def _pen(rng: np.random.Generator) -> Thing:
@@ -186,10 +186,10 @@ def _pen(rng: np.random.Generator) -> Thing:
         part((radius, radius, (1 - share) * long / 2), (0.15, rng.uniform(0.7, 1.0)), (0, 0, (1 - share) * long / 2)),
         part((cap, cap, share * long / 2), (rng.uniform(0.1, 0.5), 1.0), (0, 0, (1 - share / 2) * long)),
     ]
-    return assembled("tool", "pen", rows, (("lying", ON_Y, 0.95), ("standing", UPRIGHT, 0.05)))
+    return assemble("tool", "pen", rows, (("lying", ON_Y, 0.95), ("standing", UPRIGHT, 0.05)))
 
 
-def _handled(rng: np.random.Generator) -> Thing:
+def _add_handle(rng: np.random.Generator) -> Thing:
     """A handle with a head: hammers, screwdrivers, spatulas, brushes, spoons, torches."""
     long, thick = rng.uniform(0.1, 0.25), rng.uniform(0.012, 0.036) / 2
     flat = rng.uniform(0.5, 1.0)
@@ -204,7 +204,7 @@ def _handled(rng: np.random.Generator) -> Thing:
     else:  # a shaft
         thin, far = rng.uniform(0.002, 0.006), rng.uniform(0.04, 0.15)
         rows.append(part((thin, thin, far / 2), (0.2, 1.0), (0, 0, long + far / 2 - 0.004)))
-    return assembled("tool", "handled tool", rows, (("lying", ON_Y, 1.0),))
+    return assemble("tool", "handled tool", rows, (("lying", ON_Y, 1.0),))
 
 
 def _gun(rng: np.random.Generator) -> Thing:
@@ -219,7 +219,7 @@ def _gun(rng: np.random.Generator) -> Thing:
     ]
     if rng.random() < 0.6:
         rows.append(part((0.045, 0.03, 0.02), (0.25, 0.3), (-at, 0, 0.0)))
-    return assembled("tool", "gun", rows, (("lying", ON_Y, 0.7), ("standing", UPRIGHT, 0.3)))
+    return assemble("tool", "gun", rows, (("lying", ON_Y, 0.7), ("standing", UPRIGHT, 0.3)))
 
 
 def _toy(rng: np.random.Generator) -> Thing:
@@ -232,7 +232,7 @@ def _toy(rng: np.random.Generator) -> Thing:
         way /= np.linalg.norm(way)
         at = np.array(other[5:8]) + way * np.array(other[:3]) * rng.uniform(0.6, 1.1)
         rows.append(part(size, rng.uniform(0.1, 1.0, 2), at, quaternions.random(1, rng)[0]))
-    return assembled(
+    return assemble(
         "union", "toy", rows, (("standing", UPRIGHT, 0.5), ("lying", ON_X, 0.25), ("on its side", ON_Y, 0.25))
     )
 
@@ -245,7 +245,7 @@ def _bag(rng: np.random.Generator) -> Thing:
     rows = [part(size, rng.uniform(0.25, 0.9, 2))]
     if rng.random() < 0.4:
         rows.append(part(size * [rng.uniform(0.1, 0.4), 0.95, 0.25], (0.3, 0.3), (0, 0, 0.9 * size[2])))
-    return assembled("soft", "bag", rows, (("lying", ON_X, 0.5), ("standing", UPRIGHT, 0.5)))
+    return assemble("soft", "bag", rows, (("lying", ON_X, 0.5), ("standing", UPRIGHT, 0.5)))
 
 
 _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thing], float], ...]]] = {
@@ -253,8 +253,8 @@ _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thin
     "can": (0.18, ((_tin, 0.55), (_jar, 0.2), (_spray_can, 0.13), (_roll, 0.12))),
     "bottle": (0.24, ((bottle, 0.92), (tube, 0.08))),
     "vessel": (0.10, ((cup, 0.45), (bowl, 0.3), (tub, 0.25))),
-    "round": (0.06, ((_fruit, 0.75), (_bent, 0.25))),
-    "tool": (0.05, ((_pen, 0.35), (_handled, 0.4), (_gun, 0.25))),
+    "round": (0.06, ((_fruit, 0.75), (_bend, 0.25))),
+    "tool": (0.05, ((_pen, 0.35), (_add_handle, 0.4), (_gun, 0.25))),
     "union": (0.04, ((_toy, 1.0),)),
     "soft": (0.04, ((_bag, 1.0),)),
 }

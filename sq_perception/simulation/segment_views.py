@@ -89,7 +89,7 @@ def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
     """Views of all segments of some random scenes, and of pieces of them."""
     images, truth = [], []
     for _ in range(scenes):
-        for image, own in _views(_measured(rng), rng):
+        for image, own in _views(_measure(rng), rng):
             if np.count_nonzero(image[..., segment_view.MEASURED] * image[..., segment_view.SEGMENT]) >= _LEAST_CELLS:
                 images.append(image.astype(np.float16))
                 truth.append(own)
@@ -121,13 +121,13 @@ class _Measured:
         return np.where(near, self.shown[grid], _SMEARED), view.image[..., segment_view.MEASURED] > 0
 
 
-def _measured(rng: np.random.Generator) -> _Measured:
+def _measure(rng: np.random.Generator) -> _Measured:
     """A random image."""
     true_depth, shown, camera = _scene(rng)
     if rng.random() < _LARGER:
         true_depth = rng.uniform(*_TIMES) * true_depth
     if rng.random() < _ANY_SENSOR:
-        depth = thing_sensing.measured_by_any(true_depth, shown > 0, camera, Stages(), rng)
+        depth = thing_sensing.measure_by_any(true_depth, shown > 0, camera, Stages(), rng)
     else:
         depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(true_depth, camera, rng)
     window = _cut(shown, rng)
@@ -140,7 +140,7 @@ def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
     """True depth (height, width), +inf where nothing is, and labels of a random scene."""
     camera, kind = _camera(rng), rng.random()
     if kind < _CROWDS:
-        depth, shown = crowds.crowded_scene(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
+        depth, shown = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
         return np.where(np.isnan(depth), np.inf, depth), shown, camera
     if kind < _CROWDS + _IN_FURNITURE:
         drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)

@@ -39,7 +39,7 @@ class SensorNoise(ABC):
         if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
             raise ValueError(f"depth: expected a floating image (height, width), got {depth.dtype} {depth.shape}")
         camera.check_image(depth)
-        return self._measured(depth, camera, rng)
+        return self._measure(depth, camera, rng)
 
     def sigma(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
         """Standard deviation, metres, of a reading at depth z metres where the incidence has this cosine; broadcasts.
@@ -61,7 +61,7 @@ class SensorNoise(ABC):
         return np.zeros(np.broadcast_shapes(np.shape(z), np.shape(cosine)))
 
     @abstractmethod
-    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray: ...
+    def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray: ...
 
     @abstractmethod
     def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray: ...
@@ -76,7 +76,7 @@ class Ideal(SensorNoise):
     def __post_init__(self) -> None:
         check(self, deviation=(0.0, np.inf))
 
-    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
         seen = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
         if self.deviation == 0:
             return seen

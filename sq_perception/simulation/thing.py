@@ -132,7 +132,7 @@ def about(axis: int, degrees: float) -> Row:
     return tuple(turn)
 
 
-def assembled(
+def assemble(
     kind: str, name: str, rows: list[Row], rests: Sequence[tuple[str, np.ndarray, float]], cut: Sequence[Row] = ()
 ) -> Thing:
     """The thing of some parts, less what is cut away, moved to the middle of its box; rests by name, turn, weight."""

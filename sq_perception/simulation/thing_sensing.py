@@ -50,7 +50,7 @@ def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
     return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 4)))
 
 
-def measured_by_any(
+def measure_by_any(
     depth: np.ndarray, seen: np.ndarray, camera: Camera, stages: Stages, rng: np.random.Generator
 ) -> np.ndarray:
     """What a camera of a random sensor and these stages reports of a true depth image."""
@@ -60,7 +60,7 @@ def measured_by_any(
     if rng.random() < 0.4:
         measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:
-        measured[seen & _turned_aside(depth, camera, rng)] = np.nan
+        measured[seen & _turn_aside(depth, camera, rng)] = np.nan
     if rng.random() < 0.25:
         measured[_edges(depth, rng)] = np.nan
     if rng.random() < 0.1:
@@ -70,7 +70,7 @@ def measured_by_any(
     if rng.random() < _SHINING:
         measured[seen & _between_patches(seen, rng)] = np.nan
     if rng.random() < 0.3:
-        measured = _smoothed(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
+        measured = _smooth(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
     if rng.random() < 0.5:
         filled = ~seen & np.isnan(measured) & np.isfinite(depth)
         measured[filled] = depth[filled]
@@ -104,7 +104,7 @@ def _contours(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> 
     return (inverse * lines + rng.random()) % 1.0 < rng.uniform(0.03, 0.12)
 
 
-def _turned_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+def _turn_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
     """Surfaces that turn away to one side of the image by more than a random angle."""
     with np.errstate(invalid="ignore"):
         slope = cv2.Sobel(depth, cv2.CV_64F, 1, 0, ksize=1) * (0.5 * camera.fx) / depth
@@ -132,7 +132,7 @@ def _between_patches(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return field > np.quantile(field[seen], 1 - rng.uniform(0.3, 0.95))
 
 
-def _smoothed(measured: np.ndarray, width: int, within: np.ndarray | None) -> np.ndarray:
+def _smooth(measured: np.ndarray, width: int, within: np.ndarray | None) -> np.ndarray:
     """The mean of the readings of a window, of all of them or of those within a mask alone."""
     known = np.isfinite(measured)
     inner = known if within is None else known & within

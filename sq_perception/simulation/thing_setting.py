@@ -15,7 +15,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.union import flat_support, moved
+from sq_perception.geometry.union import flat_support, move
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
@@ -75,15 +75,15 @@ class Setting:
         """What the thing stands on, as ``table``: that, or along it the top of something."""
         return None if self.table is None else self.table - np.array([0.0, 0.0, 0.0, self.height])
 
-    def seen_from(self, place: np.ndarray, camera: Camera) -> Setting:
+    def view_from(self, place: np.ndarray, camera: Camera) -> Setting:
         """The same before a camera at ``place`` (3,), which looks the same way."""
 
-        def shifted(bodies: Superquadric) -> Superquadric:
+        def shift(bodies: Superquadric) -> Superquadric:
             return replace(bodies, translation=bodies.translation - place)
 
         table = None if self.table is None else self.table + np.array([0.0, 0.0, 0.0, self.table[:3] @ place])
         surface = None if self.surface is None else Mesh(self.surface.vertices - place, self.surface.faces)
-        parts, cavities, others = shifted(self.parts), shifted(self.cavities), shifted(self.others)
+        parts, cavities, others = shift(self.parts), shift(self.cavities), shift(self.others)
         return Setting(parts, cavities, others, table, self.behind - place[2], camera, surface, self.height)
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
@@ -104,7 +104,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     """The thing in a random pose before a random camera; see the module."""
     free = rng.random() < FREE
     turn = quaternions.random(1, rng)[0] if free else thing.pose(rng)[1]
-    parts = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    parts = move(thing.parts.to_flat(), turn, np.zeros(3))
     reach = flat_support(parts, SIX_WAYS)
     others, floor = [], 0.0
     if not free:
@@ -117,7 +117,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     lift = np.array([0.0, 0.0, reach[5]])
     look, shift, distance = _camera_pose(parts, reach, lift, rng)
     matrix = quaternions.to_matrix(look)
-    parts = moved(parts, look, shift + matrix @ lift)
+    parts = move(parts, look, shift + matrix @ lift)
     surface = None
     if thing.surface is not None:
         placed = thing.surface.vertices @ (matrix @ quaternions.to_matrix(turn)).T + shift + matrix @ lift
@@ -125,11 +125,11 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     cavities = thing.cavities
     if len(cavities):
         cavities = Superquadric.from_flat(
-            moved(cavities.to_flat(), quaternions.multiply(look, turn), shift + matrix @ lift)
+            move(cavities.to_flat(), quaternions.multiply(look, turn), shift + matrix @ lift)
         )
     table = None if free else np.append(matrix[:, 2], -(matrix[:, 2] @ shift) - floor)
     behind = distance * rng.uniform(1.3, 3.0) if rng.random() < 0.85 else np.inf
-    around = moved(np.array(others).reshape(-1, 12), look, shift)
+    around = move(np.array(others).reshape(-1, 12), look, shift)
     camera = _camera(parts, rng)
     thing_parts, others_around = Superquadric.from_flat(parts), Superquadric.from_flat(around)
     return Setting(thing_parts, cavities, others_around, table, behind, camera, surface, -floor)

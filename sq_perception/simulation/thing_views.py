@@ -33,7 +33,7 @@ from sq_perception.imaging.coherence import coherent, shown_step
 from sq_perception.simulation.camera_stages import Stages, aligned, decimated, decimated_camera, draw_stages
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.thing import Thing
-from sq_perception.simulation.thing_sensing import measured_by_any
+from sq_perception.simulation.thing_sensing import measure_by_any
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 
 OWN = 0.5
@@ -115,14 +115,14 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng)
         setting = draw_setting(thing, rng)
         stages = draw_stages(rng)
-        measured, seen, camera = _measured(setting, stages, rng)
+        measured, seen, camera = _measure(setting, stages, rng)
         plane = None
         below = setting.under if rng.random() < TOP_GIVEN else setting.table
         if below is not None and rng.random() < PLANE_GIVEN:
             plane = _imprecise(below, setting.parts.translation.mean(axis=0), rng)
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
-        mask = _masked(measured, seen, camera, setting.table if plane is None else plane, rng)
+        mask = _mask(measured, seen, camera, setting.table if plane is None else plane, rng)
         if rng.random() < LOST:
             mask = _partly(mask, rng)
         if rng.random() >= UNREAD:
@@ -138,7 +138,7 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
 
 
-def _measured(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
+def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
     """The image that a camera of these stages makes, where the thing is seen, and the camera."""
     camera = setting.camera
     depth, seen = setting.render()
@@ -149,17 +149,17 @@ def _measured(setting: Setting, stages: Stages, rng: np.random.Generator) -> tup
         middle = setting.parts.translation[:, 2].mean()
         cx = stages.focal * (camera.cx + camera.fx * stages.beside / middle)
         sensor = Camera(*size, stages.focal * camera.fx, stages.focal * camera.fy, cx, stages.focal * camera.cy)
-        near, whose = setting.seen_from(place, sensor).render()
-        measured = measured_by_any(near, whose, sensor, stages, rng) if whose.any() else near
+        near, whose = setting.view_from(place, sensor).render()
+        measured = measure_by_any(near, whose, sensor, stages, rng) if whose.any() else near
         return aligned(measured, sensor, place, camera, stages.whole), seen, camera
     depth, seen = _something_before(depth, seen, rng)
     if stages.decimation > 1:
         half = slice(stages.decimation // 2, None, stages.decimation)
         kept = decimated_camera(camera, stages.decimation)
         shown = np.s_[: kept.height, : kept.width]
-        measured = measured_by_any(depth, seen, camera, stages, rng) if seen.any() else depth
+        measured = measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth
         return decimated(measured, stages.decimation), seen[half, half][shown], kept
-    return measured_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
+    return measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
 
 
 def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -190,7 +190,7 @@ def _imprecise(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> n
     return np.append(normal, -(normal @ foot) + rng.normal(0, PLANE_SHIFT))
 
 
-def _masked(
+def _mask(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
     """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""

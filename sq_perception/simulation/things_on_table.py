@@ -24,7 +24,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.union import flat_support, moved
+from sq_perception.geometry.union import flat_support, move
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
@@ -84,7 +84,7 @@ class PlacedThing:
     @property
     def parts(self) -> Superquadric:
         """The thing's parts in the optical frame."""
-        return Superquadric.from_flat(moved(self.thing.parts.to_flat(), self.rotation, self.translation))
+        return Superquadric.from_flat(move(self.thing.parts.to_flat(), self.rotation, self.translation))
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ class _Resting:
         free = -(self.reach + other.reach[_BACK])
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
 
-    def pushed(self, way: np.ndarray, other: _Resting) -> _Resting | None:
+    def push(self, way: np.ndarray, other: _Resting) -> _Resting | None:
         """Moved along the level ``way``, from before the other one, until it touches; None if it passes by."""
         gap, closing = -(other.reach + self.reach[_BACK])[:_UP], -(_WAYS[:_UP] @ way)
         comes = closing > _ALONG
@@ -168,13 +168,13 @@ def things_on_table(
     for _ in range(_SCENES):
         look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
         eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
-        resting = _arranged(wanted, look, eye, camera, rng)
+        resting = _arrange(wanted, look, eye, camera, rng)
         if resting is not None:
             return _seen(resting, look, eye, camera, rng)
     raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
 
 
-def _arranged(
+def _arrange(
     count: int, look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> list[_Resting] | None:
     resting: list[_Resting] = []
@@ -183,7 +183,7 @@ def _arranged(
     while failed < _TRIES:
         failed += 1
         how = str(rng.choice(_HOW)) if resting else "apart"
-        placed = _drawn(draw_thing(rng), how, resting, spread, rng)
+        placed = _draw(draw_thing(rng), how, resting, spread, rng)
         if placed is None or not _in_view(placed, look, eye, camera):
             continue
         if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):
@@ -194,7 +194,7 @@ def _arranged(
     return None
 
 
-def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
+def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
     """A thing placed in one of the ways of the module; None where that way is not possible."""
     rest, turn = thing.pose(rng, leaning=0.0)
     bearing = rng.uniform(0, 2 * np.pi)
@@ -205,7 +205,7 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
         tilt = np.array([-way[1] * np.sin(half), way[0] * np.sin(half), 0.0, np.cos(half)])
         turn = quaternions.multiply(tilt, turn)
     flat_top = thing.kind == "box" or (thing.kind == "can" and rest == "standing" and len(thing.parts) == 1)
-    turned = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    turned = move(thing.parts.to_flat(), turn, np.zeros(3))
     body = _Resting(thing, rest, turn, np.zeros(3), flat_support(turned, _WAYS), flat_top and how != "leaning")
     floor = body.reach[_DOWN]
     if how == "apart":
@@ -222,12 +222,12 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
     if other.reach[_DOWN] < -1e-3:  # itself not on the table
         return None
     reach = flat_support(turned, way[None])[0]
-    where = flat_support(moved(other.thing.parts.to_flat(), other.turn, other.shift), -way[None])[0]
+    where = flat_support(move(other.thing.parts.to_flat(), other.turn, other.shift), -way[None])[0]
     along = np.array([-way[1], way[0], 0.0])
     aside = rng.normal(0, 0.01) if how == "leaning" else rng.normal(0, 0.03)
     # The plane across ``way`` that touches the other one, and this one from the other side.
     shift = way * (-where - reach) + along * (middle @ along + aside)
-    placed = body.at(np.array([*shift[:2], floor])).pushed(way, other)
+    placed = body.at(np.array([*shift[:2], floor])).push(way, other)
     if placed is not None and how == "leaning":
         if placed.reach[_UP] > other.reach[_UP] + 0.01 or thing.kind in ("round", "soft", "union"):
             return None
@@ -236,7 +236,7 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
 
 
 def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) -> bool:
-    parts = moved(moved(body.thing.parts.to_flat(), body.turn, body.shift), look, eye)
+    parts = move(move(body.thing.parts.to_flat(), body.turn, body.shift), look, eye)
     reach = flat_support(parts, SIX_WAYS)
     if -reach[5] < _NEAREST:
         return False
@@ -254,8 +254,8 @@ def _seen(
     poses = [(quaternions.multiply(look, body.turn), table @ body.shift + eye) for body in resting]
     owner = np.concatenate([np.full(len(body.thing.parts), k) for k, body in enumerate(resting)])
     whose = np.concatenate([np.full(len(body.thing.cavities), k) for k, body in enumerate(resting)])
-    parts = [moved(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
-    holes = [moved(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
+    parts = [move(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
+    holes = [move(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
     everything, cavities = (Superquadric.from_flat(np.concatenate(flat)) for flat in (parts, holes))
     wall = rng.uniform(*_WALL)
     depth, index = render_things(everything, owner, cavities, whose, camera, plane, wall)

@@ -139,7 +139,7 @@ def test_the_name_of_a_kernel_follows_what_its_module_imports(tmp_path: Path, mo
         if name:
             (package / name).write_text(sources[name] + "# changed\n")
         kernels._fingerprint.cache_clear()
-        kernels._imported.cache_clear()
+        kernels._find_imports.cache_clear()
         kept[name] = kernels._fingerprint(package / "fitting" / "residuals.py")
     assert kept["geometry/mesh.py"] == kept[""] == kept["geometry/ray.py"]
     assert len({kept[name] for name in ("fitting/residuals.py", "fitting/terms.py", "geometry/ray.py")}) == 3

@@ -38,4 +38,4 @@ def test_what_others_surround_is_enclosed():
     labels = np.ones((9, 9), np.int32)
     labels[3:6, 3:6] = 2
     met, _, _ = regions.borders(labels, np.ones(labels.shape, np.float32), 2, NEAR, FAR)
-    np.testing.assert_array_equal(regions.enclosed(met)[1:], [False, True])
+    np.testing.assert_array_equal(regions.find_enclosed(met)[1:], [False, True])

@@ -16,7 +16,7 @@ from sq_perception.commands import main
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import fixed_set
-from sq_perception.learning.dataset import ViewSource, draw_views, moved_bodies, moved_images
+from sq_perception.learning.dataset import ViewSource, draw_views, move_bodies, move_images
 from sq_perception.learning.fixed_set import FixedSet, FixedSetError, Settings, ShuffledBatches, draw, generate
 from sq_perception.simulation import view_rendering
 
@@ -182,7 +182,7 @@ class TestReading:
         """Pixels at column / (n - 1) lie symmetrically about 1/2 too: a turned frame is that of the turned body."""
         images, bodies = FixedSet(full, "train").batch(range(16))
         turns, mirror = np.arange(16) % 4, np.arange(16) // 4 % 2 == 0
-        turned, moved = moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+        turned, moved = move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
         again = FULL.values(np.stack([rendered(body, FULL) for body in moved]))
         assert (turned != again).mean() < 1e-4  # where z lies on a grey level, to the last digit
         assert (turned != images).mean() > 0.1

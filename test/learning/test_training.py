@@ -23,7 +23,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
 from sq_perception.learning.fixed_set import Settings, generate
-from sq_perception.learning.mirror_images import predicted_both_ways
+from sq_perception.learning.mirror_images import predict_with_mirror
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig, cosine
 from sq_perception.learning.training_state import mixed_precision
@@ -57,7 +57,7 @@ def endless(folder: Path, validation: int) -> list[str]:
 
 
 class TestConfig:
-    @pytest.mark.parametrize("name", training_config.shipped())
+    @pytest.mark.parametrize("name", training_config.shipped_names())
     def test_shipped_files_are_configurations(self, name: str) -> None:
         assert isinstance(training_config.read(name), TrainingConfig)
 
@@ -137,19 +137,19 @@ class TestSchedule:
     def test_plateau_divides_after_ten_and_ends_after_twenty(self) -> None:
         schedule = Plateau()
         for loss in (3.0, 2.0):
-            schedule.validated(loss)
+            schedule.record(loss)
         for _ in range(9):
-            schedule.validated(2.0)
+            schedule.record(2.0)
         assert schedule.share == 1.0
-        schedule.validated(2.5)
+        schedule.record(2.5)
         assert schedule.share == pytest.approx(0.1)
         continued = replace(schedule)
         for _ in range(10):
             assert not continued.exhausted
-            continued.validated(2.0)
+            continued.record(2.0)
         assert continued.exhausted
         assert continued.share == pytest.approx(0.01)
-        schedule.validated(1.0)
+        schedule.record(1.0)
         assert not schedule.exhausted
 
     def test_plateau_ends_a_run(self, tmp_path: Path) -> None:
@@ -328,7 +328,7 @@ class TestThesisSetting:
         # Pixels of both sizes lie at column / (n - 1); nearest neighbours make the small frame of the large one.
         chosen = np.rint(np.linspace(0, 255, 64)).astype(int)
         expected = unit_cube.optical_from_cube(
-            predicted_both_ways(model.predict, frame[None][:, chosen][:, :, chosen])
+            predict_with_mirror(model.predict, frame[None][:, chosen][:, :, chosen])
         )[0]
         assert volume_iou(body, expected) > 0.999
 
