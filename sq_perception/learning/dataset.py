@@ -90,20 +90,15 @@ def draw_views(
     return render_views(bodies, source.pixels, np.full(count, GREY_LEVELS), distance, occluder, miss)
 
 
-def grey_frames(
-    bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS, dtype: type[np.unsignedinteger] = np.uint8
-) -> np.ndarray:
-    """The thesis' images (n, p, p) of bodies (n,) of the cube frame, in 8 or 16 bit grey levels, 0 for background."""
-    camera = unit_cube.camera(pixels)
-    frames = np.empty((len(bodies), pixels, pixels), dtype=dtype)
-    for frame, body in zip(frames, unit_cube.optical_from_cube(bodies), strict=True):
-        frame[:] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], dtype)
-    return frames
-
-
 def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
-    """The thesis' 8 bit images as a network takes them: float32 (n, p, p), z of the surface, 0 for background."""
-    grey = grey_frames(bodies, pixels)
+    """Render the thesis' 8 bit images of bodies (n,) of the cube frame, as a network takes them.
+
+    Returns float32 (n, p, p), z of the surface, 0 for background.
+    """
+    camera = unit_cube.camera(pixels)
+    grey = np.empty((len(bodies), pixels, pixels), np.uint8)
+    for frame, body in zip(grey, unit_cube.optical_from_cube(bodies), strict=True):
+        frame[:] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], np.uint8)
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 

@@ -29,7 +29,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
-from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.inference import check_device
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -216,33 +215,24 @@ def _truth(bodies: Superquadric, config: TrainingConfig, device: torch.device) -
     return Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
 
 
-def _recalibrate(model: Regressor, batches: ViewPool | ShuffledBatches, batch: int) -> None:
+def _recalibrate(model: Regressor, batches: ViewPool, batch: int) -> None:
     """Measure the normalisations of an averaged network anew, on views of the training."""
     views, _ = batches.batch(max(CALIBRATION_VIEWS, batch))
     recalibrate(model, torch.from_numpy(views)[:, None], max(batch, _CALIBRATION_BATCH))
 
 
-def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> ViewPool | ShuffledBatches:
-    if not config.data:
-        # A short run holds no more views than it takes.
-        taken = max(config.steps * config.batch, CALIBRATION_VIEWS if config.average > 0 else 0)
-        disturbance = Disturbance(config.occluded_share, config.noisy_share)
-        source = ViewSource(network.pixels, config.pinhole_share, config.wide_share, disturbance, network.framing)
-        return ViewPool(rng, source, min(POOL, taken), config.reuse)
-    fixed = FixedSet(Path(config.data), "train")
-    theirs = fixed.settings
-    if (theirs.pixels, theirs.framing) != (network.pixels, network.framing):
-        raise ValueError(
-            f"{config.data}: expected {network.framing} views of {network.pixels} pixels, "
-            f"got {theirs.framing} ones of {theirs.pixels}"
-        )
-    return ShuffledBatches(fixed, rng)
+def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> ViewPool:
+    # A short run holds no more views than it takes.
+    taken = max(config.steps * config.batch, CALIBRATION_VIEWS if config.average > 0 else 0)
+    disturbance = Disturbance(config.occluded_share, config.noisy_share)
+    source = ViewSource(network.pixels, config.pinhole_share, config.wide_share, disturbance, network.framing)
+    return ViewPool(rng, source, min(POOL, taken), config.reuse)
 
 
 def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[str, tuple[np.ndarray, Superquadric]]:
     """Views and bodies that no run trains on: the thesis' images, and what a real camera makes of them."""
     count, pixels = config.validation, network.pixels
-    # A seed of its own kind: [0], [0, 0] and [0, 0, 0], of a run and of a fixed set, are the same numbers.
+    # A seed of its own kind: [0] and [0, 0], of a run, are the same numbers.
     seed = np.random.SeedSequence(0, spawn_key=(0,))
     sets = {"iou": draw_views(count, np.random.default_rng(seed), ViewSource(pixels, framing=network.framing))}
     if config.pinhole_share > 0:

@@ -99,9 +99,6 @@ class TrainingConfig:
         64, "Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."
     )
     start: str = _setting("", "A model file whose weights the network begins with; empty begins at random.")
-    data: str = _setting(
-        "", "Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."
-    )
     canonical_labels: bool = _setting(
         False, "List the axes of every label so that a1 >= a2; as drawn, their order is random."
     )
@@ -166,8 +163,6 @@ class TrainingConfig:
             raise ValueError(f"{self.loss} takes each view as it is; occluders and noise need a loss with labels")
         if self.framing == "full" and (self.pinhole_share or self.occluded_share or self.noisy_share):
             raise ValueError("full frames are the thesis' images: orthographic, whole and clean")
-        if self.data and (self.pinhole_share or self.wide_share or self.marks_hidden):
-            raise ValueError("data: the views of a fixed set are drawn already: expected shares of 0")
 
     @property
     def marks_hidden(self) -> bool:

@@ -22,7 +22,6 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
-from sq_perception.learning.fixed_set import Settings, generate
 from sq_perception.learning.mirror_images import predict_with_mirror
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig, cosine
@@ -88,7 +87,6 @@ class TestConfig:
             ("a: [", "not a YAML file"),
             ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
             ("framing: full\npinhole_share: 0.5", "orthographic"),
-            ("data: set\nnoisy_share: 0.5", "expected shares of 0"),
             ("sharpness_start: -5", "sharpness_start: expected a finite number"),
             ("seed: 18446744073709551616", "seed: expected a number below 2\\^63"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
@@ -313,7 +311,7 @@ class TestContinuation:
 
 
 class TestThesisSetting:
-    """ResNet-18 on full frames, here of 64 pixels; drawn on the fly, and from a fixed set."""
+    """ResNet-18 on full frames, here of 64 pixels."""
 
     FORM = replace(RegressorConfig.thesis(), pixels=64)
     RUN = replace(training_config.read("thesis"), steps=3, batch=4, points=32, validation=3, threads=1)
@@ -338,11 +336,3 @@ class TestThesisSetting:
         depth, labels = np.full((48, 64), 0.8, np.float32), np.ones((48, 64), np.int32)
         with pytest.raises(ValueError, match="orthographic"):
             recoverer.recover(depth, Camera(64, 48, 50, 50, 32, 24), labels)
-
-    def test_from_a_fixed_set(self, tmp_path: Path) -> None:
-        generate(tmp_path / "set", Settings("full", 64, train=24, test=0, seed=1))
-        train.train(replace(self.RUN, data=str(tmp_path / "set")), tmp_path / "run", self.FORM)
-        assert log_of(tmp_path / "run")[-1]["step"] == 3
-        other = replace(RUN, data=str(tmp_path / "set"))
-        with pytest.raises(ValueError, match="expected cropped views of 32 pixels, got full ones of 64"):
-            train.train(other, tmp_path / "other", SMALL)
