@@ -180,7 +180,7 @@ def test_a_part_far_from_the_axis_is_seen_too():
 @pytest.mark.parametrize("distortion", ["apply", "ignore"])
 def test_images_that_do_not_fit_say_what_may_be_the_reason(shape, words, distortion):
     calibration = Calibration.of(INFO, "", distortion)
-    for call in (calibration.rectified, calibration.rectified_labels):
+    for call in (calibration.rectify, calibration.rectify_labels):
         with pytest.raises(ValueError, match=f"camera_info: does not fit: .*{words}"):
             call(np.ones(shape))
     with pytest.raises(ValueError, match="does not fit"):
