@@ -45,7 +45,9 @@ def run(options: argparse.Namespace) -> int:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        reading = Reading(options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind)
+        reading = Reading(
+            options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind, frame=options.frame
+        )
         recorded = RecordedInput(
             options.frames, InputOptions(options.camera_info, topic=options.topic, reading=reading)
         )

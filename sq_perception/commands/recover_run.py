@@ -100,6 +100,7 @@ class RecoverRun:
                 options.masks,
                 options.ignore_masks,
                 options.depth_kind,
+                options.frame,
             ),
             options.camera_info_topic,
         )

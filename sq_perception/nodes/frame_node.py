@@ -41,6 +41,7 @@ from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
+from sq_perception.nodes.tracking import Pose as CameraPose
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
@@ -133,7 +134,7 @@ class FrameNode(ManagedNode):
         self._engine.follow(latest, frozenset(meanwhile))
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
         self._outputs.open(latest)
-        if latest.fixed_frame or latest.target_frame:
+        if latest.fixed_frame or latest.target_frame or latest.camera_frame:
             self._poses.listen()
         process.keep_objects()
 
@@ -234,9 +235,12 @@ class FrameNode(ManagedNode):
         """The frame of an image, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
+        self._poses.follow(stamp_of(arrival.message))
+        view: tuple[str, CameraPose] | None = None
+        if parameters.camera_frame:
+            view = parameters.camera_frame, self._found_pose(arrival.message.header, parameters, "camera_frame")
         with timed(stages, "decode"):
-            frame = source.frame(arrival, parameters)
-        self._poses.follow(stamp_of(frame))
+            frame = source.frame(arrival, parameters, view)
         answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages
@@ -244,19 +248,26 @@ class FrameNode(ManagedNode):
     def _pose_of(self, frame: Frame, parameters: RecoverParameters) -> Pose | None:
         """Where the optical frame is in that of the results, if that is another one and the workspace is there.
 
-        ValueError if it is not known.  A transform that has not come yet is waited for while other cameras compute.
+        ValueError if it is not known.
         """
         if frame.is_cube:
             return unit_cube.POSE
         if not parameters.target_frame or parameters.box is None:
             return None
-        asked = self._poses, frame.header, parameters.target_frame
+        turn, shift = self._found_pose(frame.header, parameters, "target_frame")
+        return tuple(turn.tolist()), tuple(shift.tolist())
+
+    def _found_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
+        """The pose of a header's frame in that of the parameter ``name``; ValueError if it is not known.
+
+        A transform that has not come yet is waited for while other cameras compute.
+        """
+        frame = getattr(parameters, name)
         try:
-            turn, shift = pose_in(*asked, 0.0)
+            return pose_in(self._poses, header, frame, 0.0, name)
         except ValueError:
             with TURNS.pause():
-                turn, shift = pose_in(*asked, parameters.tf_tolerance)
-        return tuple(turn.tolist()), tuple(shift.tolist())
+                return pose_in(self._poses, header, frame, parameters.tf_tolerance, name)
 
     def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
         """Name the bodies and publish them; None where that is not wanted any more."""

@@ -20,6 +20,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import size_mismatch
+from sq_msgs_py.points import label_field
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes.frame import (
     DepthMessage,
@@ -33,6 +34,7 @@ from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
+from sq_perception.nodes.tracking import Pose
 from sq_perception.recordings.cloud_file import UNORGANISED
 from sq_perception.recordings.publication import size_of
 
@@ -165,8 +167,10 @@ class Input:
                 arrival = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
             return arrival
 
-    def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:
-        """The frame of an image with what belongs to it.
+    def frame(
+        self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None
+    ) -> Frame:
+        """The frame of an image with what belongs to it; points are moved into the frame of a ``view``.
 
         Raises
         ------
@@ -179,16 +183,19 @@ class Input:
             None if source is None else lambda: self._calibration_of(message, source),
             parameters.depth_scale or None,
             parameters.depth_kind,
+            view,
         )
+        if use == "never" and frame.labels is not None:
+            frame = replace(frame, labels=None)
         if frame.notes and frame.notes != self._numbers_note:
             self._numbers_note = frame.notes
             self._node.get_logger().info(f"{self.topic}: {'; '.join(frame.notes)}", throttle_duration_sec=THROTTLE)
         if not frame.has_free_space:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
-            if use == "always":
+            if use == "always" and frame.labels is None:
                 raise ValueError("mask: expected an image or an organised cloud (use_masks is always), got another one")
             return frame  # whose pixels are those of no mask
-        if use == "always" and arrival.mask is None:
+        if use == "always" and arrival.mask is None and frame.labels is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
             raise ValueError(f"mask: {expected}, none came on {self._mask.topic}")
         if use == "auto" and arrival.needs_mask and arrival.mask is None:
@@ -231,7 +238,10 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
-        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+        has_labels = isinstance(message, PointCloud2) and label_field(message)
+        needs_mask = not has_labels and (
+            use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+        )
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")

@@ -159,13 +159,15 @@ class Outputs:
                 )
 
 
-def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
-    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises ValueError if it is not known."""
+def pose_in(
+    poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame"
+) -> Pose:
+    """The pose of a header's frame in the tf2 frame of a parameter, at its stamp.  ValueError if it is not known."""
     try:
         return poses.at(header, frame_id, patience)
     except PoseError as error:
         raise ValueError(
-            f"target_frame: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
+            f"{parameter}: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
         ) from error
 
 
