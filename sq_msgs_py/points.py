@@ -1,10 +1,11 @@
 """Measured points of a sensor_msgs/PointCloud2: x, y, z in metres, one a pixel where the cloud is organised.
 
-A field ``instance`` or ``label``, whatever its type, holds the object that each point belongs to, 0 for none.
+Another field, whatever its type, may hold the object that each point belongs to.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,9 +14,6 @@ from sq_msgs_py.columns import FLOAT32, UINT32, cloud_points
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import PointCloud2
-
-LABEL_FIELDS = ("instance", "label")
-"""Fields with the object of each point; the first of them that is there counts."""
 
 
 def points_from_message(message: PointCloud2) -> np.ndarray:
@@ -32,22 +30,17 @@ def points_from_message(message: PointCloud2) -> np.ndarray:
     return points.reshape(int(message.height), int(message.width), 3)
 
 
-def label_field(message: PointCloud2) -> str:
-    """The field with the points' labels; empty if there is none."""
-    names = {field.name for field in message.fields}
-    return next((name for name in LABEL_FIELDS if name in names), "")
-
-
-def labels_of_points(message: PointCloud2) -> np.ndarray | None:
-    """Labels (height, width) as they stand in the message; None without such a field.
+def labels_of_points(message: PointCloud2, fields: Sequence[str]) -> np.ndarray | None:
+    """Labels (height, width) as they stand in the first of these fields that is there; None without one.
 
     Raises
     ------
     MessageError
         As :func:`points_from_message`.
     """
-    name = label_field(message)
-    if not name:
+    present = {field.name for field in message.fields}
+    name = next((name for name in fields if name in present), None)
+    if name is None:
         return None
     found = cloud_points(message, [(name, UINT32)], [name])[name]
     return found.reshape(int(message.height), int(message.width))

@@ -115,7 +115,7 @@ def decode(
             frame_id, (turn, shift) = view
             header, points = Header(stamp=header.stamp, frame_id=frame_id), moved(points, to_matrix(turn), shift)
         try:
-            labels = labels_of_points(message)
+            labels = labels_of_points(message, cloud_file.LABEL_FIELDS)
             found = cloud_file.as_image(points, None if labels is None else cloud_file.labels_of(labels))
         except ValueError as error:
             raise ValueError(f"points in {header.frame_id or 'a frame without a name'}: {error}") from error

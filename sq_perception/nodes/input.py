@@ -20,7 +20,6 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import size_mismatch
-from sq_msgs_py.points import label_field
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes.frame import (
     DepthMessage,
@@ -35,7 +34,7 @@ from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
 from sq_perception.nodes.tracking import Pose
-from sq_perception.recordings.cloud_file import UNORGANISED
+from sq_perception.recordings.cloud_file import LABEL_FIELDS, UNORGANISED
 from sq_perception.recordings.publication import size_of
 
 _INFOS = 16
@@ -238,7 +237,7 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
-        has_labels = isinstance(message, PointCloud2) and label_field(message)
+        has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
         needs_mask = not has_labels and (
             use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
         )

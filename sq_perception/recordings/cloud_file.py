@@ -17,12 +17,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sq_msgs_py.points import LABEL_FIELDS
 from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError, npy_array, npz_arrays
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 
 SUFFIXES = (".pcd", ".ply")
+LABEL_FIELDS = ("instance", "label")
+"""Fields with the object of each point; the first of them that is there counts."""
 LABELLED = "the labels of the points are the masks of objects (ignore masks: segment instead)"
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")
 """Files that may hold a mesh; a PLY or OBJ may be a cloud as well."""
