@@ -35,6 +35,7 @@ from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
+from sq_perception.nodes.interfaces import RecoverInterfaces
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
@@ -113,6 +114,7 @@ class FrameNode(ManagedNode):
         apart = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
+        self._interfaces = RecoverInterfaces(self, self._next_outcome, apart)
         self.create_timer(1.0, self._on_second, clock=_STEADY)
         self.start(self._settings.current.autostart)
 
@@ -175,6 +177,11 @@ class FrameNode(ManagedNode):
         """As :meth:`ManagedNode.close`; False also while a frame or a swap of the model is still at work."""
         is_still = super().close()
         return is_still and not self._engine.is_making and (self._worker is None or not self._worker.is_alive())
+
+    def destroy_node(self) -> None:
+        """As rclpy's, with the action."""
+        self._interfaces.close()
+        super().destroy_node()
 
     def _why_locked(self) -> str:
         """Why parameters that are read at the configuration cannot change now; empty if they can."""
