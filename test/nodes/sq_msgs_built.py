@@ -7,11 +7,11 @@ from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 from spun_nodes import SpunNodes
+from std_msgs.msg import Header
+
 from sq_msgs.action import Recover as RecoverImages
 from sq_msgs.msg import GraspArray, Superquadric, SuperquadricArray
 from sq_msgs.srv import PlanGrasps, Recover
-from std_msgs.msg import Header
-
 from sq_msgs_py import superquadrics
 from sq_msgs_py.interfaces import superquadric_array
 from sq_perception.nodes.grasp_node import GraspNode
