@@ -30,6 +30,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py import answers
+from sq_perception.geometry import kernel_cache
 from sq_perception.imaging import unit_cube
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
@@ -127,6 +128,7 @@ class FrameNode(ManagedNode):
             self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
+        kernel_cache.compile_beside()
         self._engine.build(parameters)
         association.warm_up()
         latest = self._settings.current
