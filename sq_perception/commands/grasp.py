@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import add_depth, add_ignore_masks, folder, parser, positive, text_target
+from sq_perception.commands.console import (
+    add_depth,
+    add_ignore_masks,
+    folder,
+    parser,
+    positive,
+    text_target,
+    with_negatives,
+)
 
 HELP = """\
 Plan grasps of a parallel gripper on the objects of recorded depth images.
@@ -42,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
-    options = command.parse_args(arguments)
+    options = command.parse_args(with_negatives(arguments))
 
     from sq_perception.commands import grasp_run
 

@@ -15,7 +15,7 @@ from sq_perception.commands import console
 from sq_perception.commands.console import STANDARD_OUTPUT, complain, fail, reject_usage
 from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry import mesh
+from sq_perception.geometry import kernel_cache, mesh
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import planner
 from sq_perception.grasping.gripper import Gripper, gripper
@@ -39,13 +39,16 @@ _LONGEST = 10.0
 
 def run(options: argparse.Namespace) -> int:
     """What the command does with these options; the exit code."""
+    kernel_cache.compile_beside()
     try:
         hand = gripper(options.gripper)
     except ValueError as error:
         return reject_usage(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        reading = Reading(options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind)
+        reading = Reading(
+            options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind, frame=options.frame
+        )
         recorded = RecordedInput(
             options.frames, InputOptions(options.camera_info, topic=options.topic, reading=reading)
         )

@@ -32,7 +32,9 @@ A FRAME is
   an image       PNG, TIFF or NPY of 16 bit (millimetres), TIFF, NPY or EXR (extra 'exr') of floats (metres), or see
                  --depth-scale; 0 = no reading, as is the type's largest number, and what many pixels share beyond all
                  others; with --camera-info, a camera file beside it, or a YAML of its name
-  .pcd, .ply     a point cloud in the optical frame; a PCD that is an image of a pinhole camera is taken as one
+  .pcd, .ply     a point cloud in the optical frame, or see --frame; a PCD that is an image of a pinhole camera is taken
+                 as one; a field instance or label of the points, 0 for none, holds masks; also .npz with points
+                 (n, 3) or (height, width, 3) and optional labels
   .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
   a folder       all frames in it, in natural order, or those of its subfolders (four levels) where it has none;
                  camera_info.yaml, camera.json, scene_camera.json, intrinsics.json ... in it is their camera

@@ -14,6 +14,7 @@ from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, f
 from sq_perception.commands.recover_lines import lines, scene_lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
+from sq_perception.geometry import kernel_cache
 from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
@@ -35,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
         return reject_usage("--poses: expected a pinhole camera, and a method with deviations: auto or symmetry")
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
+    kernel_cache.compile_beside()
     try:
         this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
@@ -98,6 +100,7 @@ class RecoverRun:
                 options.masks,
                 options.ignore_masks,
                 options.depth_kind,
+                options.frame,
             ),
             options.camera_info_topic,
         )

@@ -16,14 +16,17 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message
-from sq_msgs_py.points import points_from_message
+from sq_msgs_py.points import labels_of_points, points_from_message
+from sq_perception.geometry.rotation import to_matrix
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.parameters import POINTS, RAW
 from sq_perception.recordings import cloud_file, publication
+from sq_perception.recordings.cloud_frame import moved
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
@@ -85,7 +88,11 @@ class Frame:
 
 
 def decode(
-    message: DepthMessage, calibration_of: Callable[[], Calibration] | None, scale: float | None = None, kind: str = "z"
+    message: DepthMessage,
+    calibration_of: Callable[[], Calibration] | None,
+    scale: float | None = None,
+    kind: str = "z",
+    view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Frame:
     """The frame of a depth image message; raises ValueError for anything that keeps it from being processed.
 
@@ -99,36 +106,43 @@ def decode(
         asked for clouds.
     scale, kind
         Units a metre, None: by the encoding; and whether the image holds "z" or "range".
+    view
+        The camera's optical frame and the pose, quaternion and translation, of the points in it; None: they are in it.
     """
     if isinstance(message, PointCloud2):
-        points = points_from_message(message) / np.float32(scale or 1.0)
+        header, points = message.header, points_from_message(message) / np.float32(scale or 1.0)
+        if view is not None:
+            frame_id, (turn, shift) = view
+            header, points = Header(stamp=header.stamp, frame_id=frame_id), moved(points, to_matrix(turn), shift)
         try:
-            depth, seen, is_image = cloud_file.as_image(points)
+            labels = labels_of_points(message, cloud_file.LABEL_FIELDS)
+            found = cloud_file.as_image(points, None if labels is None else cloud_file.labels_of(labels))
         except ValueError as error:
-            raise ValueError(f"points in {message.header.frame_id or 'a frame without a name'}: {error}") from error
-        numbers = {name: round(getattr(seen, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
-        calibration = Calibration(replace(seen, **numbers))
-        return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)
+            raise ValueError(f"points in {header.frame_id or 'a frame without a name'}: {error}") from error
+        numbers = {name: round(getattr(found.camera, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
+        notes = () if labels is None else (cloud_file.LABELLED,)
+        calibration = Calibration(replace(found.camera, **numbers))
+        return Frame(header, "32FC1", found.depth, calibration, found.labels, found.is_image, notes)
     if calibration_of is None:
         if message.encoding in DEPTH_ENCODINGS:
             raise ValueError(
                 f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
                 "metric depth images of a camera need projection = pinhole"
             )
-        found, encoding = publication.depth_of(message, is_cube=True)
-        height, width = found.depth.shape
-        return Frame(message.header, encoding, found.depth, Calibration(unit_cube.camera(width, height)))
+        image, encoding = publication.depth_of(message, is_cube=True)
+        height, width = image.depth.shape
+        return Frame(message.header, encoding, image.depth, Calibration(unit_cube.camera(width, height)))
     if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
         raise ValueError(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )
-    found, encoding = publication.depth_of(message, False, scale)
+    image, encoding = publication.depth_of(message, False, scale)
     calibration = calibration_of()
-    depth = calibration.rectify(found.depth)
+    depth = calibration.rectify(image.depth)
     if kind == "range":
         depth = depth_units.z_from_range(depth, calibration.camera)
-    return Frame(message.header, encoding, depth, calibration, notes=found.notes)
+    return Frame(message.header, encoding, depth, calibration, notes=image.notes)
 
 
 def image_topic(node: Node, transport: str) -> str:

@@ -30,17 +30,20 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py import answers
+from sq_perception.geometry import kernel_cache
 from sq_perception.imaging import unit_cube
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
+from sq_perception.nodes.interfaces import RecoverInterfaces
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
+from sq_perception.nodes.tracking import Pose as CameraPose
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
@@ -112,6 +115,7 @@ class FrameNode(ManagedNode):
         apart = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
+        self._interfaces = RecoverInterfaces(self, self._next_outcome, apart)
         self.create_timer(1.0, self._on_second, clock=_STEADY)
         self.start(self._settings.current.autostart)
 
@@ -124,6 +128,7 @@ class FrameNode(ManagedNode):
             self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
+        kernel_cache.compile_beside()
         self._engine.build(parameters)
         association.warm_up()
         latest = self._settings.current
@@ -133,7 +138,7 @@ class FrameNode(ManagedNode):
         self._engine.follow(latest, frozenset(meanwhile))
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
         self._outputs.open(latest)
-        if latest.fixed_frame or latest.target_frame:
+        if latest.fixed_frame or latest.target_frame or latest.camera_frame:
             self._poses.listen()
         process.keep_objects()
 
@@ -174,6 +179,11 @@ class FrameNode(ManagedNode):
         """As :meth:`ManagedNode.close`; False also while a frame or a swap of the model is still at work."""
         is_still = super().close()
         return is_still and not self._engine.is_making and (self._worker is None or not self._worker.is_alive())
+
+    def destroy_node(self) -> None:
+        """As rclpy's, with the action."""
+        self._interfaces.close()
+        super().destroy_node()
 
     def _why_locked(self) -> str:
         """Why parameters that are read at the configuration cannot change now; empty if they can."""
@@ -234,9 +244,12 @@ class FrameNode(ManagedNode):
         """The frame of an image, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
+        self._poses.follow(stamp_of(arrival.message))
+        view: tuple[str, CameraPose] | None = None
+        if parameters.camera_frame:
+            view = parameters.camera_frame, self._found_pose(arrival.message.header, parameters, "camera_frame")
         with timed(stages, "decode"):
-            frame = source.frame(arrival, parameters)
-        self._poses.follow(stamp_of(frame))
+            frame = source.frame(arrival, parameters, view)
         answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages
@@ -244,19 +257,26 @@ class FrameNode(ManagedNode):
     def _pose_of(self, frame: Frame, parameters: RecoverParameters) -> Pose | None:
         """Where the optical frame is in that of the results, if that is another one and the workspace is there.
 
-        ValueError if it is not known.  A transform that has not come yet is waited for while other cameras compute.
+        ValueError if it is not known.
         """
         if frame.is_cube:
             return unit_cube.POSE
         if not parameters.target_frame or parameters.box is None:
             return None
-        asked = self._poses, frame.header, parameters.target_frame
+        turn, shift = self._found_pose(frame.header, parameters, "target_frame")
+        return tuple(turn.tolist()), tuple(shift.tolist())
+
+    def _found_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
+        """The pose of a header's frame in that of the parameter ``name``; ValueError if it is not known.
+
+        A transform that has not come yet is waited for while other cameras compute.
+        """
+        frame = getattr(parameters, name)
         try:
-            turn, shift = pose_in(*asked, 0.0)
+            return pose_in(self._poses, header, frame, 0.0, name)
         except ValueError:
             with TURNS.pause():
-                turn, shift = pose_in(*asked, parameters.tf_tolerance)
-        return tuple(turn.tolist()), tuple(shift.tolist())
+                return pose_in(self._poses, header, frame, parameters.tf_tolerance, name)
 
     def _publish(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
         """Name the bodies and publish them; None where that is not wanted any more."""

@@ -31,6 +31,7 @@ from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import answers, transforms
 from sq_msgs_py import grasps as messages
+from sq_msgs_py.interfaces import grasp_array
 from sq_msgs_py.markers import Mesh, markers
 from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_of
@@ -40,6 +41,7 @@ from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched_qos, stamp_of
+from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
@@ -68,12 +70,14 @@ class GraspNode(ManagedNode):
         self._marker_ids = MarkerIds()
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
+        self._array: Publisher | None = None
         self._publishing = threading.Lock()
         """Held while something is published, or nothing is any more."""
         self._clouds: Listener | None = None
         self._planes: Any = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/plan", self._on_plan)
+        optional(self, self.create_service, "sq_msgs/srv/PlanGrasps", "~/plan_array", self._on_plan_array)
         with suppress(ImportError):
             self.create_service(installed("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -90,6 +94,7 @@ class GraspNode(ManagedNode):
             self.create_publisher(PointCloud2, "~/grasp_details", 10),
             self.create_publisher(MarkerArray, "~/markers", 10),
         ]
+        self._array = optional(self, self.create_publisher, "sq_msgs/msg/GraspArray", "~/grasp_array", 10)
         self._planes = self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched_qos())
         self._heard_at = monotonic()
         self._clouds = Listener(self, PointCloud2, "superquadrics", self._on_cloud, self._statistics)
@@ -105,9 +110,9 @@ class GraspNode(ManagedNode):
                 shown = self._outputs[-1]
                 shown.publish(self._markers([], [], self._last.header))
                 shown.wait_for_all_acked(ARRIVAL)
-            for publisher in self._outputs:
+            for publisher in (*self._outputs, *([] if self._array is None else [self._array])):
                 self.destroy_publisher(publisher)
-            self._outputs = []
+            self._outputs, self._array = [], None
 
     def _cleanup(self) -> None:
         self._deactivate()
@@ -156,6 +161,13 @@ class GraspNode(ManagedNode):
         if found and cloud:
             response.success = True
             response.message = answers.text_of(found, cloud.header, response.message)
+        return response
+
+    def _on_plan_array(self, request: Any, response: Any) -> Any:
+        cloud = self._last
+        found, response.message = self._plan_again(cloud)
+        if found and cloud:
+            response.success, response.grasps = True, grasp_array(found, cloud.header)
         return response
 
     def _on_plan_grasps(self, request: Any, response: Any) -> Any:
@@ -222,6 +234,8 @@ class GraspNode(ManagedNode):
         poses, details, shown = self._outputs
         poses.publish(messages.poses(found, header))
         details.publish(messages.to_message(found, header))
+        if self._array is not None:
+            self._array.publish(grasp_array(found, header))
         best = {int(bodies.id[grasp.body]): grasp for grasp in reversed(plan.grasps)}
         meshes = []
         for grasp in best.values():

@@ -33,7 +33,8 @@ from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
-from sq_perception.recordings.cloud_file import UNORGANISED
+from sq_perception.nodes.tracking import Pose
+from sq_perception.recordings.cloud_file import LABEL_FIELDS, UNORGANISED
 from sq_perception.recordings.publication import size_of
 
 _INFOS = 16
@@ -165,8 +166,10 @@ class Input:
                 arrival = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
             return arrival
 
-    def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:
-        """The frame of an image with what belongs to it.
+    def frame(
+        self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None
+    ) -> Frame:
+        """The frame of an image with what belongs to it; points are moved into the frame of a ``view``.
 
         Raises
         ------
@@ -179,16 +182,19 @@ class Input:
             None if source is None else lambda: self._calibration_of(message, source),
             parameters.depth_scale or None,
             parameters.depth_kind,
+            view,
         )
+        if use == "never" and frame.labels is not None:
+            frame = replace(frame, labels=None)
         if frame.notes and frame.notes != self._numbers_note:
             self._numbers_note = frame.notes
             self._node.get_logger().info(f"{self.topic}: {'; '.join(frame.notes)}", throttle_duration_sec=THROTTLE)
         if not frame.has_free_space:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
-            if use == "always":
+            if use == "always" and frame.labels is None:
                 raise ValueError("mask: expected an image or an organised cloud (use_masks is always), got another one")
             return frame  # whose pixels are those of no mask
-        if use == "always" and arrival.mask is None:
+        if use == "always" and arrival.mask is None and frame.labels is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
             raise ValueError(f"mask: {expected}, none came on {self._mask.topic}")
         if use == "auto" and arrival.needs_mask and arrival.mask is None:
@@ -231,7 +237,10 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
-        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+        has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
+        needs_mask = not has_labels and (
+            use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+        )
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")

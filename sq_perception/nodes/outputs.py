@@ -33,12 +33,14 @@ from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
+from sq_msgs_py.interfaces import superquadric_array
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_message
 from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import transforms
 from sq_perception.nodes.frame import Frame, latched_qos
+from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
@@ -98,7 +100,9 @@ class Outputs:
         self.markers = create(MarkerArray, "~/markers", 1)
         self.rendered_depth = create(Image, "~/rendered_depth", 1)
         self.support_plane = create(PoseStamped, "~/support_plane", latched_qos())
-        self._publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane
+        self.array = optional(self._node, create, "sq_msgs/msg/SuperquadricArray", "~/superquadric_array", 10)
+        publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane, self.array
+        self._publishers = tuple(one for one in publishers if one is not None)
         self.optional.follow(parameters)
 
     def close(self) -> None:
@@ -142,6 +146,8 @@ class Outputs:
     ) -> None:
         """Publish what goes with the answer, and note the time of each stage.  What goes wrong is logged, no more."""
         try:
+            if self.array is not None and self.array.get_subscription_count():
+                self.array.publish(superquadric_array(shown.array, shown.covariances, shown.header))
             with timed(stages, "outputs"):
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
@@ -159,13 +165,15 @@ class Outputs:
                 )
 
 
-def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
-    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises ValueError if it is not known."""
+def pose_in(
+    poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame"
+) -> Pose:
+    """The pose of a header's frame in the tf2 frame of a parameter, at its stamp.  ValueError if it is not known."""
     try:
         return poses.at(header, frame_id, patience)
     except PoseError as error:
         raise ValueError(
-            f"target_frame: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
+            f"{parameter}: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
         ) from error
 
 

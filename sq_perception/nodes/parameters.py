@@ -140,8 +140,16 @@ class RecoverParameters(Parameters):
         "tf2 frame of the results, by the transform at the image's stamp; an image without it is refused. Empty: the "
         "image's.",
     )
+    camera_frame: str = setting(
+        "",
+        "tf2 frame, optical, of the camera that took the points (image_transport: points), where they come in another "
+        "one. Empty: that of the points.",
+    )
     tf_tolerance: float = setting(
-        0.1, "How long an image waits for transforms (fixed_frame, target_frame).", unit="s", within=(0.0, 5.0)
+        0.1,
+        "How long an image waits for transforms (camera_frame, fixed_frame, target_frame).",
+        unit="s",
+        within=(0.0, 5.0),
     )
     publish_tf: bool = setting(False, "Publish a frame for each body on /tf.")
     tf_prefix: str = setting(
@@ -204,8 +212,10 @@ class RecoverParameters(Parameters):
                 raise ParameterError(
                     f"{name}: expected {expected or 'none'} for projection = orthographic, got {given}"
                 )
-        for name in ("fixed_frame", "target_frame"):
+        for name in ("camera_frame", "fixed_frame", "target_frame"):
             _check_frame(name, getattr(self, name))
+        if self.camera_frame and self.image_transport != POINTS:
+            raise ParameterError(f"camera_frame: expected image_transport = {POINTS}, got {self.image_transport}")
         _check_prefix(self.tf_prefix)
 
 
