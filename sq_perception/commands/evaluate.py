@@ -40,7 +40,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception evaluate``; the exit code, which is that of a failure if a model could not be read."""
+    """Run ``sq-perception evaluate``; return the exit code, a failure if a model could not be read."""
     command = parser("evaluate", _HELP, _EPILOG)
     add = command.add_argument
     add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
@@ -88,7 +88,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
 
 
 def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
-    """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
+    """Return the contestants with their number of bodies, and the errors of those that cannot take part."""
     from sq_perception.evaluation.contest import fit, network, unique_names
     from sq_perception.learning.checkpoint import CheckpointError, shipped_regressors
 

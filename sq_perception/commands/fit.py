@@ -41,7 +41,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception fit``; the exit code."""
+    """Run ``sq-perception fit``; return the exit code."""
     command = parser("fit", HELP, EPILOG)
     add = command.add_argument
     add("files", nargs="+", metavar="FILE", help="clouds or meshes of one object each")

@@ -29,7 +29,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception grasp``; the exit code."""
+    """Run ``sq-perception grasp``; return the exit code."""
     command = parser("grasp", HELP, EPILOG)
     add = command.add_argument
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")

@@ -106,7 +106,7 @@ obstacles:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception recover``; the exit code."""
+    """Run ``sq-perception recover``; return the exit code."""
     command = parser("recover", HELP, EPILOG)
     add_frames(command)
     add = command.add_argument

@@ -21,7 +21,7 @@ _AXES = re.compile(" along [xyz]( and [xyz])*")
 
 
 def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
-    """All frames, then the reasons with the number of bodies that they hold for."""
+    """Return the lines of all frames, then the reasons with their number of bodies."""
     reasons: Counter[tuple[str, str]] = Counter()
     for entry in entries:
         stamp = entry["stamp"]
@@ -42,7 +42,7 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
 
 
 def scene_lines(scene: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """The bodies of all frames together, in the world of their camera poses."""
+    """Return the lines of the bodies of all frames together, in the world of their camera poses."""
     for body in scene:
         edges, place = edges_as_text(body["size"], body["sigma_size"], False), place_as_text(body["translation"], False)
         yield f"  {body['status']} {edges} at {place} id {body['id']}, in {body['seen']} frames"

@@ -50,7 +50,7 @@ files:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception render``; the exit code."""
+    """Run ``sq-perception render``; return the exit code."""
     command = parser("render", _HELP, _EPILOG)
     add = command.add_argument
     for name in PARAMETERS:

@@ -19,7 +19,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception sample``; the exit code."""
+    """Run ``sq-perception sample``; return the exit code."""
     command = parser("sample", _HELP, _EPILOG)
     command.add_argument("output", type=target, metavar="FILE", help="an .npz")
     output = command.parse_args(arguments).output

@@ -27,7 +27,7 @@ The same command goes on with a run that was stopped.  The output folder holds t
 
 
 def thing_views(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception thing-views``; the exit code."""
+    """Run ``sq-perception thing-views``; return the exit code."""
     example = "sq-perception thing-views sets/things --shards 200 && sq-perception train-things sets/things"
     command = _drawing("thing-views", "canonical views of simulated household things", example, shards=100)
     command.add_argument("--views", type=at_least(1), default=512, help="views a shard (512)")
@@ -47,7 +47,7 @@ def thing_views(arguments: Sequence[str]) -> int:
 
 
 def segment_views(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception segment-views``; the exit code."""
+    """Run ``sq-perception segment-views``; return the exit code."""
     example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
     what = "segments of simulated scenes, and which of their readings are of their object,"
     command = _drawing("segment-views", what, example, shards=40)
@@ -60,7 +60,7 @@ def segment_views(arguments: Sequence[str]) -> int:
 
 
 def train_things(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train-things``; the exit code."""
+    """Run ``sq-perception train-things``; return the exit code."""
     text = _TRAIN.format(
         what="predicts the unseen side of things",
         views="views that `thing-views` wrote",
@@ -75,7 +75,7 @@ def train_things(arguments: Sequence[str]) -> int:
 
 
 def train_masks(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train-masks``; the exit code."""
+    """Run ``sq-perception train-masks``; return the exit code."""
     text = _TRAIN.format(
         what="finds strays in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
     )
@@ -88,7 +88,7 @@ def train_masks(arguments: Sequence[str]) -> int:
 
 
 def _drawing(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
-    """The parser of both commands that draw, with what they share."""
+    """Make the common parser of both commands that draw."""
     command = parser(name, _DRAW.format(what=what), f"example:\n  {example}")
     add = command.add_argument
     add("folder", type=Path, help="of the shards")
@@ -99,7 +99,7 @@ def _drawing(name: str, what: str, example: str, shards: int) -> argparse.Argume
 
 
 def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[Any], Any]]) -> int:
-    """Write the shards with what ``drawing`` gives, which may have to read something first."""
+    """Write the shards that ``drawing`` gives, which may first read something."""
     from sq_perception.geometry.threads import one_kernel_thread
     from sq_perception.learning.shard_training import write_views
 
@@ -112,7 +112,7 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
 
 
 def _training(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
-    """The parser of both commands that train, with what they share."""
+    """Make the common parser of both commands that train."""
     command = parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
     add = command.add_argument

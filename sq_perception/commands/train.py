@@ -26,7 +26,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train``; the exit code."""
+    """Run ``sq-perception train``; return the exit code."""
     command = parser("train", _HELP, _EPILOG)
     command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
     shipped = ", ".join(training_config.shipped_names())

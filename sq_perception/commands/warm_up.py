@@ -15,7 +15,7 @@ _HELP = "Compile every kernel once and keep it on disk (about two minutes), so t
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception warm-up``: run every step and print how long each took."""
+    """Run ``sq-perception warm-up``: run every step and print how long each took."""
     parser("warm-up", _HELP).parse_args(arguments)
     logging.getLogger("sq_perception.geometry.kernel_cache").setLevel(logging.ERROR)  # it says itself how far it is
     for name, action in steps():
@@ -27,7 +27,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
-    """Name and action of everything that compiles."""
+    """Return name and action of each step that compiles."""
     import numpy as np
 
     from sq_perception.fitting import solina_bajcsy, surface_fit

@@ -38,7 +38,7 @@ _KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
 
 
 def _directions() -> np.ndarray:
-    """(33, 3) closing directions in the frame of a body, one of each opposite pair."""
+    """Return (33, 3) closing directions in a body's frame, one of each opposite pair."""
     found = [np.eye(3)]
     for first, second in ((0, 1), (0, 2), (1, 2)):
         angle = np.delete(np.arange(12), 6)[1:] * _STEP
@@ -51,7 +51,7 @@ DIRECTIONS = _directions()
 
 @dataclass(frozen=True, eq=False)
 class KnownBodies:
-    """Bodies as far as they are known, n of them.
+    """n bodies with their uncertainty.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class KnownBodies:
 
     @classmethod
     def of(cls, bodies: Superquadric, covariance: np.ndarray | None) -> KnownBodies:
-        """A NumPy batch (n,) and covariances (n, 11, 11); of numbers whose variance is unknown a wide guess is taken.
+        """Make them from a NumPy batch (n,) and covariances (n, 11, 11); an unknown variance becomes a wide guess.
 
         Raises
         ------
@@ -102,17 +102,17 @@ class KnownBodies:
         return self.flat[:, 5:8]
 
     def in_place(self) -> KnownBodies:
-        """The bodies with centres that are known for sure."""
+        """Return the bodies with centres that are known exactly."""
         covariance = self.covariance.copy()
         covariance[:, 3:6] = covariance[:, :, 3:6] = 0.0
         return replace(self, covariance=covariance)
 
     def reaches(self, owner: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """h(n) (k,) and the standard deviation (k,) of n.t + h(n), for bodies ``owner`` (k,) and directions (k, 3)."""
+        """Return h(n) (k,) and the sigma (k,) of n.t + h(n), for bodies ``owner`` (k,) and directions (k, 3)."""
         return _reaches(self.flat, self.turns, self.covariance, owner, directions)
 
     def middle_angles(self, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Angle (k,) between directions (k, 3) and the normals where the lines through the centre along them leave.
+        """Return the angle (k,) between directions (k, 3) and the normals where central lines along them leave.
 
         The gradient of the gauge is the same all along such a line, but for tapers, which are left out of account.
         """
@@ -125,7 +125,7 @@ class KnownBodies:
     def chords(
         self, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray, steepest: float = np.pi
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
+        """Find where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
 
         Returns
         -------
@@ -179,7 +179,7 @@ def _reaches(
 def _chords(
     body: np.ndarray, turn: np.ndarray, offset: np.ndarray, direction: np.ndarray, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends and cosines (2, k) of chords of one body; at the second end of those alone whose first cosine is enough."""
+    """Return ends and cosines (2, k) of one body's chords; second ends only where the first cosine is large enough."""
     at, way = np.empty((3, len(offset))), np.empty((3, len(offset)))
     for k in range(len(offset)):
         for i in range(3):
@@ -196,7 +196,7 @@ def _chords(
 
 @kernel
 def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, cosine: np.ndarray) -> None:
-    """Where lines from at (3, k) along way (3, k), in a body's own frame, leave it, and the cosine to the normal there.
+    """Return where lines from at (3, k) along way (3, k) leave a body, in its frame, and the cosine to the normal.
 
     They start where they leave the box around the body: g is convex along them, and Newton's steps from outside stay
     outside, or come near to the surface from inside where a body tapers.  A step is one loop over all lines that has no

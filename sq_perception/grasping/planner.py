@@ -87,7 +87,7 @@ def grasps(
     friction: float = FRICTION,
     placement: float = PLACEMENT,
 ) -> GraspPlan:
-    """Plan grasps of some bodies; those that have none come with the reason.
+    """Plan grasps of some bodies, with the reason for those that have none.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def grasps(
 
 
 def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
-    """Which bodies (n,) lie wholly behind the plane."""
+    """Return which bodies (n,) lie wholly behind the plane."""
     if plane is None:
         return np.zeros(len(bodies), dtype=bool)
     top, _ = bodies.reaches(np.arange(len(bodies)), np.tile(plane[:3], (len(bodies), 1)))
@@ -146,7 +146,7 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
 
 
 def _probable(trials: Trials, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """The ``count`` best of each body that has any; the weakest margin of the best one is the reason of the others."""
+    """Return each body's ``count`` best grasps; for the others, the best one's weakest margin as the reason."""
     found = trials.first(count, np.log(_LEAST))
     without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
@@ -171,7 +171,7 @@ def _trials(
     friction: float,
     placement: float,
 ) -> Trials:
-    """Every closing from every side, at every depth and slide, with the margins that the body alone decides."""
+    """Return every closing from every side, at every depth and slide, with the margins of the body alone."""
     narrow, broad = np.arctan([friction, _AT_MOST * friction])
     cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
     every = approaches.from_every_side(bodies, found, gripper, around, placement)
@@ -199,7 +199,7 @@ def _trials(
 
 
 def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:
-    """The trials with better margins where fingers end above the middle and so above where a body is widest."""
+    """Return the trials with better margins where fingers end above the middle, so above the widest section."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
     beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
     rows = np.flatnonzero((beside * z).sum(axis=1) < 0)
@@ -222,7 +222,7 @@ def _among_others(
     around: Surroundings,
     placement: float,
 ) -> Trials:
-    """The best trials with the margins that the surroundings decide."""
+    """Return the best trials with the margins of the surroundings."""
     if not len(trials.owner):
         return trials
     boxes = gripper.boxes_at(trials.opening)
@@ -242,7 +242,7 @@ def _among_others(
 
 
 def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
-    """Count sides and near ends only as far as the image does not show that they are empty; points tell the rest."""
+    """Weight sides and near ends by the share that the image does not show to be empty; points tell the rest."""
     turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
     hidden = around.hidden_share(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
     shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(log_phi(gap + PASSES, np.hypot(SIDE_SIGMA, placement)))
@@ -251,7 +251,7 @@ def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Sur
 
 
 def _as_grasps(trials: Trials) -> Iterator[Grasp]:
-    """All trials as grasps, the most probable first."""
+    """Convert all trials to grasps, the most probable first."""
     total = trials.total
     order = np.argsort(-total, kind="stable")
     turns = quaternions.from_matrix(trials.frames[:, :, :3])

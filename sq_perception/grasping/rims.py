@@ -52,7 +52,7 @@ _WALLS = 0.3
 def at_rims(
     bodies: Superquadric, which: np.ndarray, gripper: Gripper, around: Surroundings, friction: float, placement: float
 ) -> Trials:
-    """Grasps of bodies ``which`` by their rims, with all margins but those that the surroundings decide."""
+    """Find grasps of bodies ``which`` by their rims, with all margins but those of the surroundings."""
     found = [] if around.plane is None else [rim for k in which for rim in _rims(bodies[k], int(k), gripper, around)]
     owner = np.array([rim[0] for rim in found], dtype=int).repeat(len(_INSETS))
     inset = np.tile(_INSETS, len(found))
@@ -82,7 +82,7 @@ def at_rims(
 def _rims(
     body: Superquadric, owner: int, gripper: Gripper, around: Surroundings
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """Owner, frame (3, 4) on the rim, y outwards, and thickness of the wall of each bearing that has one."""
+    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim."""
     assert around.plane is not None
     upwards = around.plane[:3] @ body.rotation_matrix
     axis = int(np.argmax(np.abs(upwards)))
@@ -105,7 +105,7 @@ def _rims(
 
 
 def _is_open(trials: Trials, fingers: np.ndarray, around: Surroundings) -> np.ndarray:
-    """Whether the image shows something beyond most of the end of each finger (k, 6)."""
+    """Return whether the image shows something beyond most of the end of each finger (k, 6)."""
     grid = np.array([[x, y, 1.0] for x in (-0.8, 0.0, 0.8) for y in (-0.8, 0.0, 0.8)])
     local = fingers[:, None, :3] + grid * fingers[:, None, 3:]
     ends = local @ trials.frames[:, :, :3].transpose(0, 2, 1) + trials.frames[:, None, :, 3]

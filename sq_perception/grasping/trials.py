@@ -54,16 +54,16 @@ class Trials(NamedTuple):
 
     @property
     def total(self) -> np.ndarray:
-        """Logarithm (k,) of the probability that all margins are kept."""
+        """Return the logarithm (k,) of the probability that all margins hold."""
         return np.asarray(np.einsum("ij->i", self.logs))
 
     @property
     def weakest(self) -> np.ndarray:
-        """Index (k,) of the margin that takes most from each trial."""
+        """Return the index (k,) of the least probable margin of each trial."""
         return np.asarray(np.argmin(self.logs, axis=1))
 
     def first(self, count: int, least: float = -np.inf) -> Trials:
-        """The most probable ones of each body, each body's in order, without those below the logarithm ``least``."""
+        """Return the most probable trials of each body in order, without those below the logarithm ``least``."""
         total = self.total
         rows = np.flatnonzero(total >= least)  # also what cannot hold, -inf: why it does not is a reason
         rows = rows[np.lexsort((-total[rows], self.owner[rows]))]
@@ -73,19 +73,19 @@ class Trials(NamedTuple):
 
 
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
-    """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
+    """Return log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
     return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
 
 
 def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
-    """log Phi(m / sigma), never below log(1e-12); nothing is known to less than a micrometre."""
+    """Return log Phi(m / sigma), at least log(1e-12); sigma is at least a micrometre."""
     from scipy.special import ndtr  # here: a node that recovers does without
 
     return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
 
 
 def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = _PAD_RADIUS) -> np.ndarray:
-    """log P (k,) that a friction of both pads of ``force`` lifts a mass, ``lever`` beside the closing line.
+    """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line.
 
     As a force, and as a torque that the friction holds by its mean ``arm``.
     """

@@ -70,7 +70,7 @@ synthetic_depth_node = partial(_run, "synthetic_depth_node")
 
 
 def recover_cameras(arguments: Sequence[str] | None = None) -> int:
-    """A recover_node for each camera of the command line."""
+    """Run one recover_node per camera on the command line."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser("recover_cameras", " CAMERA ...")
     parser.add_argument("cameras", nargs="+", metavar="CAMERA", type=_namespace, help="namespace of a camera")
@@ -95,12 +95,12 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
 
 
 def _before_ros(arguments: list[str]) -> list[str]:
-    """What is not for ROS."""
+    """Return the arguments that are not for ROS."""
     return arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
 
 
 def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
-    """Refuses what a program does not take; its help has the parameters with their defaults."""
+    """Make a parser that refuses unknown arguments; its help lists the parameters with their defaults."""
     kind = name.replace("recover_cameras", "recover_node")
     parameters = fast_dds.configuration_file(f"{kind}.yaml").read_text(encoding="utf-8")
     return argparse.ArgumentParser(
@@ -113,7 +113,7 @@ def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
 
 
 def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
-    """One of this package's nodes, by the name of its program."""
+    """Create one of this package's nodes by the name of its program."""
     if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 

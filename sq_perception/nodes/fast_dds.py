@@ -27,7 +27,7 @@ _LOCK = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
 
 
 def configuration_file(name: str) -> Path:
-    """A shipped file: beside the package's modules where it is installed, in ``config/`` of a source tree."""
+    """Return a shipped file: beside the modules if installed, in ``config/`` of a source tree."""
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "config", package.parent / "config"):
         if (folder / name).is_file():
@@ -36,17 +36,17 @@ def configuration_file(name: str) -> Path:
 
 
 def profile_path() -> Path:
-    """The shipped profile."""
+    """Return the path of the shipped profile."""
     return configuration_file(_FILE)
 
 
 def additions() -> dict[str, str]:
-    """What the environment lacks: the variable of the shipped profile, or nothing if it names one."""
+    """Return what to add to the environment: the variable of the shipped profile, or nothing if a profile is set."""
     return {} if os.environ.get(VARIABLE) else {VARIABLE: str(profile_path())}
 
 
 def remove_orphans(folder: Path = FOLDER) -> tuple[str, ...]:
-    """Delete this user's segments of dead owners that are older than :data:`LEAST_AGE`; their names.
+    """Delete this user's segments of dead owners older than :data:`LEAST_AGE`; return their names.
 
     What cannot be read or removed stays, and nothing is raised for it.  Ports (``fastrtps_port<number>``) stay too:
     they are few, small, and taken over by the next process with the same number.

@@ -54,7 +54,7 @@ _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
 
 
 class GraspNode(ManagedNode):
-    """See the module."""
+    """Node that plans grasps; see the module."""
 
     def __init__(self, name: str, *, context: Any = None) -> None:
         super().__init__(name, context=context)
@@ -80,7 +80,7 @@ class GraspNode(ManagedNode):
         self.start(self._settings.current.autostart)
 
     def _configure(self) -> None:
-        """Compile or load the kernels, so that no first cloud waits."""
+        """Compile or load the kernels, so that the first cloud does not wait."""
         warm_up()
 
     def _activate(self) -> None:
@@ -132,7 +132,8 @@ class GraspNode(ManagedNode):
         return 1e-9 * self.get_clock().now().nanoseconds
 
     def _age(self, cloud: PointCloud2) -> float:
-        """Seconds since the image of the last cloud; since the cloud came where its stamp is of another clock."""
+        """Return the seconds since the stamp of the last cloud, or since its arrival if the stamp is of another
+        clock."""
         now, stamp = self._now(), 1e-9 * stamp_of(cloud)
         since = max(now - self._arrival, 0.0)
         return max(now - stamp, since) if stamp and now - stamp < OLDEST else since
@@ -190,12 +191,12 @@ class GraspNode(ManagedNode):
         return found, f"{text}; {age:.1f} s old"
 
     def _plane_in(self, header: Any) -> np.ndarray | None:
-        """The last plane, where it is in the frame of that header."""
+        """Return the last plane if it is in the frame of this header."""
         plane = self._plane
         return plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
 
     def _answer(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
-        """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
+        """Plan and publish; return the grasps and why bodies have none.  No message ends the node."""
         try:
             if message.header.frame_id == CUBE_FRAME:
                 raise ValueError("views of the unit cube have no metres to grasp in")
@@ -231,12 +232,12 @@ class GraspNode(ManagedNode):
         return found
 
     def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
-        """Markers of grasps, by their bodies' ids, which replace the markers before."""
+        """Return markers of grasps with their bodies' ids, which replace the earlier ones."""
         return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replace_markers(ids))
 
 
 def plan(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
-    """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
+    """Plan grasps as the parameters say; excluded bodies are obstacles without grasps."""
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement
     plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)

@@ -45,7 +45,7 @@ instead it would be again and again, and a camera that sends so many within ``pa
 
 @dataclass(frozen=True)
 class Arrival:
-    """A depth image and what came with it.
+    """A depth image with its camera_info and mask.
 
     Its size is None for what is no image, which is to be refused at once.  It came at a time and waits for its
     companions until a deadline, seconds of the monotonic clock.
@@ -68,7 +68,7 @@ class _Info:
 
 
 class Input:
-    """The subscriptions of an active node, and what came.
+    """The subscriptions of an active node and their messages.
 
     An image that comes while none ``is_wanted`` is dropped at once.
     """
@@ -108,7 +108,7 @@ class Input:
         self._image = Listener(node, kind, self.topic, self._on_image, statistics)
 
     def follow_publishers(self) -> None:
-        """Hear publishers as they offer, and a camera_info that was published once before; called each second."""
+        """Adapt to the publishers and to a latched camera_info; called each second."""
         for listener in self._listeners:
             listener.follow()
         if self._info is not None and self._latched is None and not self._is_closed:
@@ -120,16 +120,16 @@ class Input:
 
     @property
     def silence(self) -> float:
-        """Seconds since the last depth image."""
+        """Return the seconds since the last depth image."""
         return monotonic() - self._last_image
 
     @property
     def heard(self) -> str:
-        """Who publishes depth images, and whether they can be heard."""
+        """Describe who publishes depth images, and whether they can be received."""
         return self._image.publishers
 
     def close(self) -> None:
-        """Listen no more, and let the worker go; what waits is dropped."""
+        """Stop listening and release the worker; drop what waits."""
         with self._changed:
             self._is_closed = True
             left = len(self._waiting) + (self._ready is not None)
@@ -157,7 +157,7 @@ class Input:
             return False
 
     def take(self) -> Arrival | None:
-        """The image that :meth:`wait` waited for, or a newer one; None if there is none."""
+        """Return the image that :meth:`wait` waited for, or a newer one; None if there is none."""
         with self._changed:
             self._promote(monotonic())
             arrival, self._ready = self._ready, None
@@ -166,7 +166,7 @@ class Input:
             return arrival
 
     def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:
-        """The frame of an image with what belongs to it.
+        """Decode an image with its camera_info and mask.
 
         Raises
         ------
@@ -242,7 +242,7 @@ class Input:
             self._promote(now)
 
     def _on_info(self, message: CameraInfo) -> None:
-        """Keep a camera_info; a useless one is kept as the reason for refusing frames of its size."""
+        """Store a camera_info; an invalid one is stored as the reason for refusing frames of its size."""
         size, calibration, fault = (int(message.width), int(message.height)), None, ""
         try:
             calibration = Calibration.of(message, self.topic, self._settings.current.distortion)
@@ -259,7 +259,7 @@ class Input:
             self._promote(monotonic())
 
     def _on_mask(self, message: Image) -> None:
-        """Keep a label image for the depth image of the same stamp; one without a stamp belongs to none."""
+        """Store a label image for the depth image with its stamp; ignore one without a stamp."""
         if stamp_of(message) == 0:
             return
         with self._changed:
@@ -271,7 +271,7 @@ class Input:
     # What waits, with the lock held
 
     def _promote(self, now: float) -> None:
-        """Make the newest image ready that is complete or has waited long enough; it takes the place of older ones."""
+        """Make the newest image ready that is complete or has waited long enough; it replaces older ones."""
         ready = [k for k, arrival in enumerate(self._waiting) if arrival.deadline <= now or self._is_complete(arrival)]
         if not ready and len(self._waiting) > _WAITING:
             ready = [0]
@@ -291,7 +291,7 @@ class Input:
         return has_info and (not arrival.needs_mask or stamp in self._masks)
 
     def _knows_camera(self, size: tuple[int, int], stamp: int) -> bool:
-        """Whether the camera_info of an image has come, or will say what those before it do.
+        """Return whether the camera_info of an image has arrived, or an earlier one will do.
 
         Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
         another one's would shift every body.

@@ -59,7 +59,7 @@ _MOST_AGAIN = 32
 
 
 class MarkerIds:
-    """Ids of the markers that a listener may still show: those of the last message, and for a while those before.
+    """Ids of markers that a listener may still show: those of the last message, and for a while earlier ones.
 
     A listener that is busy loses messages, and a marker whose deletion was in a lost one would stay for good.
     """
@@ -69,7 +69,7 @@ class MarkerIds:
         """Until when they are deleted, in the order in which they went; endless while they are shown."""
 
     def replace_markers(self, ids: Sequence[int]) -> list[int]:
-        """The ids whose markers the next message, which shows ``ids``, has to delete."""
+        """Return the ids whose markers the next message, which shows ``ids``, must delete."""
         now, shown = monotonic(), dict.fromkeys(ids, math.inf)
         gone = {number: until for number, until in self._until.items() if until >= now and number not in shown}
         again = dict([one for one in gone.items() if one[1] < math.inf][-_MOST_AGAIN:])
@@ -79,7 +79,7 @@ class MarkerIds:
 
 
 class Outputs:
-    """Publishes frames; used by one thread at a time.  ``poses`` know where the camera is in ``target_frame``."""
+    """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
 
     def __init__(self, node: Node, poses: CameraPoses) -> None:
         self._node, self._poses = node, poses
@@ -90,7 +90,7 @@ class Outputs:
         """Header of the markers that are shown, if there are any."""
 
     def open(self, parameters: RecoverParameters) -> None:
-        """Create what is published."""
+        """Create the publishers."""
         create = partial(
             self._node.create_publisher, qos_overriding_options=QoSOverridingOptions(policy_kinds=_OVERRIDABLE)
         )
@@ -102,7 +102,7 @@ class Outputs:
         self.optional.follow(parameters)
 
     def close(self) -> None:
-        """Destroy the publishers; what planners know stays with them, markers go."""
+        """Destroy the publishers and delete the markers; planners keep their objects."""
         if self._publishers:
             self.hide()
             self.markers.wait_for_all_acked(ARRIVAL)
@@ -112,13 +112,13 @@ class Outputs:
         self.optional.close()
 
     def hide(self) -> None:
-        """Delete the markers: nobody moves them from now on."""
+        """Delete the markers, since nothing updates them from now on."""
         if self._header is not None and self._node.context.ok():
             header, self._header = self._header, None
             self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replace_markers(())))
 
     def shown_bodies(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
-        """What was found as every output shows it: in ``target_frame`` if there is one.
+        """Return the findings as every output shows them: in ``target_frame`` if there is one.
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
         """
@@ -140,7 +140,7 @@ class Outputs:
     def accompany(
         self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters, stages: dict[str, float]
     ) -> None:
-        """Publish what goes with the answer, and note the time of each stage.  What goes wrong is logged, no more."""
+        """Publish the other outputs and note the time of each stage.  Errors are only logged."""
         try:
             with timed(stages, "outputs"):
                 self.optional.publish(shown, parameters, found.hidden)
@@ -160,7 +160,7 @@ class Outputs:
 
 
 def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
-    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises ValueError if it is not known."""
+    """Return the pose of a header's frame in another tf2 frame at its stamp.  Raises ValueError if it is unknown."""
     try:
         return poses.at(header, frame_id, patience)
     except PoseError as error:
@@ -170,7 +170,8 @@ def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> 
 
 
 def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
-    """Findings in another tf2 frame; as they are for an empty ``frame_id``.  Raises ValueError as :func:`pose_in`."""
+    """Return findings in another tf2 frame; unchanged for an empty ``frame_id``.  Raises ValueError as
+    :func:`pose_in`."""
     return found.move(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 
@@ -183,8 +184,7 @@ _KINDS = {
 
 
 class OptionalOutputs:
-    """Messages for other stacks, as far as the parameters ask for them; used by one thread at a time, except for
-    ``absent``."""
+    """Messages for other stacks that the parameters enable; used by one thread, except for ``absent``."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -196,7 +196,7 @@ class OptionalOutputs:
         self._all_due = 0.0
 
     def follow(self, parameters: RecoverParameters) -> None:
-        """Create the publishers that are asked for, and destroy the others."""
+        """Create the publishers that are enabled, and destroy the others."""
         asked = [parameter for parameter in _KINDS if getattr(parameters, parameter)]
         self.absent = {parameter: package for parameter, package in self.absent.items() if parameter in asked}
         for parameter in asked:
@@ -208,7 +208,7 @@ class OptionalOutputs:
             self._node.destroy_publisher(self._publishers.pop(parameter))
 
     def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
-        """Publish what a frame showed, where it is asked for and somebody listens.
+        """Publish a frame on the outputs that are enabled and have subscribers.
 
         Parameters
         ----------
@@ -235,7 +235,7 @@ class OptionalOutputs:
     def _publish_scene(
         self, planners: Publisher, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
     ) -> None:
-        """Publish what has changed of the planning scene, from time to time all of it."""
+        """Publish the changes of the planning scene, from time to time all of it."""
         if monotonic() >= self._all_due:
             self._scene.repeat()
             self._all_due = monotonic() + _ALL_AGAIN
@@ -253,7 +253,7 @@ class OptionalOutputs:
             planners.publish(collision_objects.planning_scene(objects))
 
     def withdraw(self) -> bool:
-        """Remove every object that was added to the planning scene, as nobody looks after it; whether there was one."""
+        """Remove every object from the planning scene, since nothing updates it; return whether there was one."""
         publisher = self._publishers.get("publish_collision_objects")
         objects = self._scene.clear() if publisher is not None else []
         if publisher is not None and objects:
@@ -261,7 +261,7 @@ class OptionalOutputs:
         return bool(objects)
 
     def close(self) -> None:
-        """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
+        """Destroy the publishers; objects stay in the planning scene and are remembered."""
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         self._publishers = {}
@@ -282,11 +282,11 @@ class OptionalOutputs:
             )
 
     def _note_listener(self, parameter: str, event: Any) -> None:
-        """A planner that has come, or has started again, knows nothing; called in the executor's thread."""
+        """Note a planner that has started and knows nothing; called in the executor's thread."""
         if parameter == "publish_collision_objects" and event.current_count_change > 0:
             self._planner_came.set()
 
     def _heard(self, parameter: str) -> Publisher | None:
-        """The publisher of what is asked for, if somebody listens."""
+        """Return the publisher of an enabled output, if it has subscribers."""
         publisher = self._publishers.get(parameter)
         return publisher if publisher is not None and publisher.get_subscription_count() else None
