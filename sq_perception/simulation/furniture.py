@@ -35,7 +35,7 @@ _TRIES = 20
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """The smallest rectangle around all things along some direction, and a margin.
+    """The smallest rectangle around all objects along some direction, and a margin.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class _Place:
         return cls(axes, middle, (high - low)[:2] / 2, float(high[2] - ground))
 
     def box(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> Superquadric:
-        """A box between two corners, which count from the middle."""
+        """Return a box between two corners, relative to the middle."""
         below, above = np.array(low), np.array(high)
         centre = self.middle + self.axes @ (below + above) / 2
         return Superquadric((above - below) / 2, np.full(2, _SHARP), centre, quaternions.from_matrix(self.axes))
@@ -147,7 +147,7 @@ KINDS = tuple(_KINDS)
 
 
 def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:
-    """Things in or on a piece of furniture, one of ``KINDS``; those that it hides altogether are left out.
+    """Draw objects in or on a piece of furniture, one of ``KINDS``; hidden ones are left out.
 
     ``plane`` is the one that they stand on.
 

@@ -38,7 +38,7 @@ def render_things(
     table: np.ndarray | None = None,
     behind: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and visible thing of every pixel.
+    """Render depth and the index of the visible object of every pixel.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def render_things(
 
 @kernel
 def _add_background(plane: np.ndarray, behind: float, lens: Lens, depth: np.ndarray, thing: np.ndarray) -> None:
-    """Table and wall where they are nearer than the things, in place."""
+    """Add table and wall where they are nearer than the objects, in place."""
     fx, fy, cx, cy, _ = lens
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -115,14 +115,14 @@ def _hollow_out(
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles: vertices (n, 3), and faces (m, 3) of vertex indices."""
+    """A triangle mesh: vertices (n, 3), and faces (m, 3) of vertex indices."""
 
     vertices: np.ndarray
     faces: np.ndarray
 
 
 def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
-    """Depth (height, width) of a mesh in the optical frame; +inf where there is none.
+    """Render the depth (height, width) of a mesh in the optical frame; +inf for no surface.
 
     Faces are seen from both sides.
 

@@ -29,7 +29,7 @@ _SHAPES = (0.1, 1.0)
 
 
 def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
-    """The depth (height, width) of a scene whose table ends; its things, and what hides them, stay as they are."""
+    """Return the depth (height, width) of a scene with a room behind its table; its objects and occluders stay."""
     camera, normal = scene.camera, scene.plane[:3]
     angle = rng.uniform(-_TURN, _TURN)
     away = scene.table @ np.array([np.sin(angle), np.cos(angle), 0.0])
@@ -57,7 +57,7 @@ def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
 def _standing_at(
     foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
 ) -> Superquadric:
-    """A body on the floor under a point of it, moved from the table where it would reach under its top."""
+    """Return a body on the floor below a point, moved from the table if it would reach under its top."""
     least, most = np.log(_HALF_SIZES)
     size, turn = np.exp(rng.uniform(least, most, 3)), turn_about_up(rng.uniform(0, np.pi))
     clear = foot @ away - edge - np.hypot(*size[:2])

@@ -39,7 +39,7 @@ class Sample:
 
 
 def sample(seed: int = 0) -> Sample:
-    """The frame; the seed is that of the sensor's noise."""
+    """Simulate the frame; the seed is that of the sensor's noise."""
     up = np.array([0.0, -np.cos(_PITCH), -np.sin(_PITCH)])
     right = np.array([1.0, 0.0, 0.0])
     table = np.stack([right, np.cross(up, right), up], axis=1)

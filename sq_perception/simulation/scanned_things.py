@@ -28,7 +28,7 @@ _USUAL = 0.99
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
-    """All meshes of a folder, by name.
+    """Read all meshes of a folder, by name.
 
     Raises
     ------

@@ -86,7 +86,7 @@ class SegmentViews:
 
 
 def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
-    """Views of all segments of some random scenes, and of pieces of them."""
+    """Draw views of all segments of some random scenes, and of pieces of them."""
     images, truth = [], []
     for _ in range(scenes):
         for image, own in _views(_measure(rng), rng):
@@ -102,7 +102,7 @@ def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """An image (height, width) that a sensor took of things; ``shown`` are their labels, 0 for none."""
+    """An image (height, width) that a sensor took; ``shown`` are the labels of its objects, 0 for none."""
 
     depth: np.ndarray
     true_depth: np.ndarray
@@ -114,7 +114,7 @@ class _Measured:
         return segment_view.from_segment(self.depth, labels, label, window, self.camera, plane)
 
     def in_cells(self, view: SegmentView) -> tuple[np.ndarray, np.ndarray]:
-        """What the cells (p, p) of a view show, labels or ``_SMEARED``, and whether something was measured there."""
+        """Return what the cells (p, p) of a view show, labels or ``_SMEARED``, and whether they have a reading."""
         height, width = self.depth.shape
         grid = np.ix_(np.clip(view.rows, 0, height - 1), np.clip(view.columns, 0, width - 1))
         near = np.abs(self.depth[grid] - self.true_depth[grid]) < _OFF + _OFF_SHARE * self.depth[grid]
@@ -122,7 +122,7 @@ class _Measured:
 
 
 def _measure(rng: np.random.Generator) -> _Measured:
-    """A random image."""
+    """Draw a random image."""
     true_depth, shown, camera = _scene(rng)
     if rng.random() < _LARGER:
         true_depth = rng.uniform(*_TIMES) * true_depth
@@ -137,7 +137,7 @@ def _measure(rng: np.random.Generator) -> _Measured:
 
 
 def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """True depth (height, width), +inf where nothing is, and labels of a random scene."""
+    """Draw the true depth (height, width), +inf for no surface, and labels of a random scene."""
     camera, kind = _camera(rng), rng.random()
     if kind < _CROWDS:
         depth, shown = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
@@ -151,7 +151,7 @@ def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
 
 
 def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Images and truth of segments, and of pieces of them."""
+    """Return images and truth of segments, and of pieces of them."""
     found = segments.segment(measured.depth, measured.camera)
     for label in found.ids:
         view = measured.view(found.labels, label, found.plane)
@@ -164,7 +164,7 @@ def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.n
 def _of_merged(
     label: int, found: segments.Segmentation, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Images and truth of each thing that a segment shows, if several, and of pieces of it and a neighbour as one."""
+    """Return images and truth of each object in a merged segment, and of pieces of it joined to a neighbour."""
     mask = found.labels == label
     counts = np.bincount(measured.shown[mask], minlength=1)
     things = np.flatnonzero(counts[1:] > _PART * counts.sum()) + 1
@@ -183,7 +183,7 @@ def _of_merged(
 def _of_pieces(
     view: SegmentView, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Images and truth of pieces of a segment that show one thing: of one of them, or if they show several, of all."""
+    """Return images and truth of pieces of a segment that show one object: one piece, or all if they show several."""
     cells, known = measured.in_cells(view)
     segment = view.image[..., segment_view.SEGMENT] > 0
     some, of = [], []
@@ -207,7 +207,7 @@ def _camera(rng: np.random.Generator) -> Camera:
 
 
 def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
-    """A window of the image; some are small, about a thing or beside it, so that their borders cut things."""
+    """Return a window of the image; some are small, at or beside an object, so that their borders cut objects."""
     height, width = shown.shape
     if rng.random() >= _SMALLER:
         return slice(0, height), slice(0, width)
@@ -220,7 +220,7 @@ def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
 
 
 def _object(shown: np.ndarray) -> int:
-    """The thing that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
+    """Return the object that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
     counts = np.bincount(shown, minlength=2)
     most, total = int(counts[1:].argmax()) + 1, counts.sum()
     has_none = counts[0] >= _MOSTLY_NOTHING * total and counts[most] <= _SOME_THING * total
@@ -228,5 +228,5 @@ def _object(shown: np.ndarray) -> int:
 
 
 def _truth(cells: np.ndarray, known: np.ndarray, thing: int) -> np.ndarray:
-    """NO, YES or UNKNOWN (p, p)."""
+    """Return NO, YES or UNKNOWN (p, p)."""
     return np.where(known, np.where(cells == thing, YES, NO), UNKNOWN).astype(np.uint8)

@@ -91,7 +91,7 @@ PRESETS: Mapping[str, SensorNoise] = MappingProxyType(
 
 
 def preset(name: str) -> SensorNoise:
-    """The sensor of this name.
+    """Return the sensor of this name.
 
     Raises
     ------

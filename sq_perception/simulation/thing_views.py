@@ -68,7 +68,7 @@ _ON_TABLE = 0.003
 
 @dataclass(frozen=True, eq=False)
 class ThingViews:
-    """Views of n things, p x p pixels.
+    """Views of n objects, p x p pixels.
 
     Attributes
     ----------
@@ -92,7 +92,7 @@ class ThingViews:
 
 
 def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] = ()) -> ThingViews:
-    """Views of ``count`` random things, half of them one's ``own`` where there are such."""
+    """Draw views of ``count`` random objects, half of them of ``own`` objects if there are any."""
     images = np.empty((count, _PIXELS, _PIXELS), dtype=np.float32)
     planes, extents = np.zeros((count, 4), np.float32), np.empty(count, np.float32)
     support, numbers = np.empty((count, len(DIRECTIONS)), np.float32), np.empty(count, dtype=np.int64)
@@ -104,13 +104,13 @@ def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] 
 
 
 def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
-    """The support function (42,) of a union, given in the optical frame, as :class:`ThingViews` has it."""
+    """Return the support function (42,) of a union in the optical frame, as in :class:`ThingViews`."""
     directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
     return (support_of_union(parts, directions) - directions @ view.anchor) / view.extent
 
 
 def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
-    """A thing, its view, the plane in the view's frame and its support function."""
+    """Draw an object, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng)
         setting = draw_setting(thing, rng)
@@ -139,7 +139,7 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
 
 
 def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """The image that a camera of these stages makes, where the thing is seen, and the camera."""
+    """Draw the image of a camera with these stages, the object's visible pixels, and the camera."""
     camera = setting.camera
     depth, seen = setting.render()
     if stages.beside:
@@ -183,7 +183,7 @@ def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Genera
 
 
 def _imprecise(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The plane as it is found: tilted about the point below ``at`` and shifted."""
+    """Return the plane as it would be found: tilted about the point below ``at`` and shifted."""
     normal = plane[:3] + PLANE_TILT * rng.standard_normal(3)
     normal /= np.linalg.norm(normal)
     foot = at - (plane[:3] @ at + plane[3]) * plane[:3]
@@ -193,7 +193,7 @@ def _imprecise(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> n
 def _mask(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
-    """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""
+    """Draw a mask as from a segmentation or a person, without readings of the table, as in views of images."""
     error = int(rng.choice(_MASK_ERRORS))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:
@@ -214,7 +214,7 @@ def _mask(
 
 
 def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The mask without what lies beyond a straight line."""
+    """Remove from the mask what lies beyond a straight line."""
     v, u = np.nonzero(mask)
     if not v.size:
         return mask
@@ -228,7 +228,7 @@ def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _cut(
     measured: np.ndarray, mask: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """The image and the mask, in some cases cut off within the thing or near to it, and their camera."""
+    """Return image, mask and camera, in some cases cropped within or near the object."""
     if rng.random() > 0.1:
         return measured, mask, camera
     v, u = np.nonzero(mask)

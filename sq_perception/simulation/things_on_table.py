@@ -60,7 +60,7 @@ _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
 
 @dataclass(frozen=True, eq=False)
 class PlacedThing:
-    """One thing of a scene.
+    """One object of a scene.
 
     Attributes
     ----------
@@ -83,13 +83,13 @@ class PlacedThing:
 
     @property
     def parts(self) -> Superquadric:
-        """The thing's parts in the optical frame."""
+        """The object's parts in the optical frame."""
         return Superquadric.from_flat(move(self.thing.parts.to_flat(), self.rotation, self.translation))
 
 
 @dataclass(frozen=True, eq=False)
 class ThingsOnTable:
-    """A scene, its true image and its truth.
+    """A scene with its true image and its truth.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class ThingsOnTable:
 
 @dataclass(frozen=True, eq=False)
 class _Resting:
-    """A thing in the table's frame, its support in ``_WAYS`` and whether something may stand on it."""
+    """An object in the table's frame, its support in ``_WAYS`` and whether others may stand on it."""
 
     thing: Thing
     rest: str
@@ -130,12 +130,12 @@ class _Resting:
         return replace(self, shift=self.shift + by, reach=self.reach + _WAYS @ by)
 
     def apart(self, other: _Resting, gap: float) -> bool:
-        """Whether a tried plane lies between both, ``gap`` wide; level ones need none."""
+        """Return whether a tried plane separates both by ``gap``; level planes need no gap."""
         free = -(self.reach + other.reach[_BACK])
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
 
     def push(self, way: np.ndarray, other: _Resting) -> _Resting | None:
-        """Moved along the level ``way``, from before the other one, until it touches; None if it passes by."""
+        """Push along the level ``way``, from before the other one, until it touches; None if it passes by."""
         gap, closing = -(other.reach + self.reach[_BACK])[:_UP], -(_WAYS[:_UP] @ way)
         comes = closing > _ALONG
         ends = (gap[comes] / closing[comes]).max()
@@ -151,7 +151,7 @@ def things_on_table(
     camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION,
 ) -> ThingsOnTable:
-    """``count`` things, or 1 to 8, on a table, all of them wholly inside the image.
+    """Place ``count`` objects, or 1 to 8, on a table, all wholly inside the image.
 
     The camera is ``elevation`` (least, greatest) degrees above the table.
 
@@ -195,7 +195,7 @@ def _arrange(
 
 
 def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
-    """A thing placed in one of the ways of the module; None where that way is not possible."""
+    """Place an object in one of the ways of the module; None if that is not possible."""
     rest, turn = thing.pose(rng, leaning=0.0)
     bearing = rng.uniform(0, 2 * np.pi)
     way = np.array([np.cos(bearing), np.sin(bearing), 0.0])
