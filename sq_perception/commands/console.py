@@ -178,12 +178,12 @@ def add_frames(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="intrinsics of images and bags, before their own: a file of K, or fx,fy,cx,cy",
     )
-    add("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
-    add("--camera-info-topic", metavar="NAME", help="their camera_info, where it is not beside them")
+    add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
+    add("--camera-info-topic", metavar="NAME", help="camera_info topic, if it is not beside the depth topic")
     add_depth(command)
     add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
     methods = ("auto", "network", "symmetry", "classic")
-    add("--method", choices=methods, default="auto", help="how bodies are found: the methods of recover --help")
+    add("--method", choices=methods, default="auto", help="recovery method, see recover --help")
     add_ignore_masks(command)
 
 
@@ -193,7 +193,7 @@ def add_depth(command: argparse.ArgumentParser) -> None:
         "--depth-scale",
         type=positive,
         metavar="N",
-        help="units a metre (as a camera file states, else 1000 of whole numbers, 1 of floats)",
+        help="units per metre (default: from a camera file, else 1000 for integers, 1 for floats)",
     )
     command.add_argument(
         "--depth-kind",
@@ -205,7 +205,7 @@ def add_depth(command: argparse.ArgumentParser) -> None:
 
 def add_ignore_masks(command: argparse.ArgumentParser) -> None:
     """Add the option that ignores the labels of frames."""
-    command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+    command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
 def progress() -> Progress:

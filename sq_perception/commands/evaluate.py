@@ -19,8 +19,8 @@ _HELP = """\
 Compare networks and fits on one test set of the thesis' protocol, and write its tables 6.1 to 6.3 and 7.1 to 7.4 with
 the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), and examples.
 
-A network takes part alone, unrefined, from the 256 x 256 image on; the loss in its file's header decides its row of the
-thesis.  Fits: auto (network and surface fit), symmetry (surface fit alone), classic (Solina and Bajcsy).
+Networks are evaluated without a fit, from the 256 x 256 image; the loss in the file's header selects the row of the
+thesis.  Fits: auto (network and surface fit), symmetry (surface fit only), classic (Solina and Bajcsy).
 """
 _EPILOG = """\
 writes into --output:
@@ -28,9 +28,9 @@ writes into --output:
   results.json   every figure, the command, versions, processor, commit and seeds
   *.png          the pictures
 
-A model file that cannot be read is reported and left out; the exit code is then 1.  The bodies are those of no
-training, and the first n are the same for every --bodies.  Expect 7 ms a body to draw the images, and 10 ms for each
-network and 15 ms for each fit; times of execution mean something on a quiet machine only.
+Unreadable model files are reported and skipped; the exit code is then 1.  No training uses these bodies, and the first
+n are the same for every --bodies.  Expect 7 ms per body for the images, 10 ms per network and 15 ms per fit; execution
+times are meaningful only on an idle machine.
 
 examples:
   sq-perception evaluate

@@ -27,13 +27,13 @@ COMMANDS = {
     "render": ("render:main", "draw a superquadric as a depth image"),
     "demo": ("demo:main", "a simulated camera and real ROS 2 nodes (extra 'ros')"),
     "train": ("train:main", "train a network"),
-    "thing-views": ("shards:thing_views", "draw views of household things to train on"),
-    "train-things": ("shards:train_things", "train the network that predicts the unseen side of things"),
-    "segment-views": ("shards:segment_views", "draw segments of simulated scenes to train on"),
-    "train-masks": ("shards:train_masks", "train the network that finds strays in segments"),
+    "thing-views": ("shards:thing_views", "draw training views of household objects"),
+    "train-things": ("shards:train_things", "train the network that predicts the unseen side of objects"),
+    "segment-views": ("shards:segment_views", "draw training segments of simulated scenes"),
+    "train-masks": ("shards:train_masks", "train the network that finds foreign readings in segments"),
     "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
     "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
-    "warm-up": ("warm_up:main", "compile everything once, so that no first image waits"),
+    "warm-up": ("warm_up:main", "compile all kernels in advance"),
 }
 """Name, module of this folder and its function, and summary."""
 

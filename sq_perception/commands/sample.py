@@ -8,7 +8,7 @@ from sq_perception.commands.console import SUCCESS, parser, reject_usage, target
 from sq_perception.files import output_file
 
 _HELP = """\
-Write a depth image of four things on a table, as a simulated RealSense D435 measures it, and print their true sizes.
+Write a simulated RealSense D435 depth image of four objects on a table, and print their true sizes.
 The NPZ holds what `sq-perception recover` reads of one: depth (metres, NaN = no reading) and K (3 x 3).
 """
 _EPILOG = """\

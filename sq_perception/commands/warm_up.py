@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 from sq_perception.commands.console import SUCCESS, parser
 
-_HELP = "Compile every kernel once and keep it on disk (about two minutes), so that no first image has to wait."
+_HELP = "Compile every kernel and keep it on disk (about two minutes), so that the first image does not wait."
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -196,7 +196,7 @@ class Engine:
             if built is not None:
                 self._built, self._is_to_read = built, False
         if fault:
-            log.error(f"{fault}; what was there before goes on")
+            log.error(f"{fault}; the previous one stays active")
         else:
             log.info(f"changed to {_describe(parameters)} within {perf_counter() - started:.1f} s")
 

@@ -28,14 +28,14 @@ _ABOUT = {
     "recover_node": """\
 Depth images in, superquadrics out.
 
-takes      depth/image and depth/camera_info, or depth/points; mask/image if there are masks
+subscribes depth/image and depth/camera_info, or depth/points; mask/image if there are masks
 publishes  ~/superquadrics ~/markers ~/rendered_depth ~/support_plane /diagnostics
 services   ~/enable ~/trigger ~/recover, and those of a lifecycle node""",
     "fitter_node": "recover_node with the classic fit of Solina and Bajcsy, with the same topics.",
     "grasp_node": """\
 Superquadrics in, grasps of a parallel gripper out.
 
-takes      superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
+subscribes superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
 publishes  ~/grasps ~/grasp_details ~/markers /diagnostics
 services   ~/plan, ~/plan_grasps where moveit_msgs is installed, and those of a lifecycle node""",
     "synthetic_depth_node": """\
@@ -47,11 +47,10 @@ One process with a recover_node for each of several cameras, which share one net
 
     ros2 run sq_perception recover_cameras front wrist --ros-args --params-file cameras.yaml
 
-makes /front/recover_node and /wrist/recover_node, which take /front/depth/image, /wrist/depth/image and so on.
+makes /front/recover_node and /wrist/recover_node, which subscribe to /front/depth/image, /wrist/depth/image and so on.
 Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_node: for one.
 
-Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
-once each and let them compete for the same cores.""",
+Frames are computed in turn: one process per camera would load the network several times and compete for the cores.""",
 }
 _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 """Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""

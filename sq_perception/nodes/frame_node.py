@@ -168,7 +168,7 @@ class FrameNode(ManagedNode):
         if self._worker is not None:
             self._worker.join(_WORKER_END)
             if self._worker.is_alive():
-                self.get_logger().warning("the frame at hand takes long; it is the last one, and is not published")
+                self.get_logger().warning("the current frame takes long; it is the last one and is not published")
 
     def close(self) -> bool:
         """Close as :meth:`ManagedNode.close`; also False while a frame or a model change is in progress."""

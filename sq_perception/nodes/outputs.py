@@ -129,8 +129,8 @@ class Outputs:
         """Publish plane and point cloud."""
         if not shown.header.frame_id:
             self._node.get_logger().warning(
-                "the images have no frame_id, and so have the results: RViz and tf2 cannot place them, and there are "
-                "no transforms or collision objects; the camera driver has to set it",
+                "the images have no frame_id: RViz and tf2 cannot place the results, and there are no transforms or "
+                "collision objects; the camera driver must set it",
                 throttle_duration_sec=THROTTLE,
             )
         if shown.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
@@ -154,7 +154,7 @@ class Outputs:
         except Exception as error:
             if self._node.context.ok():
                 self._node.get_logger().warning(
-                    f"a result was published without all that goes with it: {type(error).__name__}: {error}",
+                    f"a result was published without its other outputs: {type(error).__name__}: {error}",
                     throttle_duration_sec=THROTTLE,
                 )
 

@@ -151,7 +151,7 @@ class Tracking:
             self._session.reset()
             raise ValueError(f"tracking: {error}") from error
         if self._session.tally.resets > resets:
-            self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
+            self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are dropped, ids continue")
         return identify(recovery, tracks, self._session.hidden)
 
     def _camera_pose(self, frame: Frame, parameters: RecoverParameters) -> tuple[Pose | None, bool]:
@@ -168,4 +168,4 @@ class Tracking:
 
     def _forget(self, why: str) -> None:
         self._session.reset()
-        self._node.get_logger().info(f"{why}: tracks are forgotten, ids go on")
+        self._node.get_logger().info(f"{why}: tracks are dropped, ids continue")
