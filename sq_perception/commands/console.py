@@ -1,4 +1,4 @@
-"""What all commands have in common: exit codes, complaints of one line, help texts, and checks of what was given."""
+"""Common parts of all commands: exit codes, one-line complaints, help texts, and checks of arguments."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""``sq-perception demo``: a simulated camera, recover_node and fitter_node, and how well both methods did.
+"""``sq-perception demo``: a simulated camera, recover_node and fitter_node, and the accuracy of both methods.
 
-The nodes run in this process and talk over ROS 2, in a domain of their own on this machine unless ROS_DOMAIN_ID or
+The nodes run in this process and communicate over ROS 2, in their own domain on this machine unless ROS_DOMAIN_ID or
 ROS_AUTOMATIC_DISCOVERY_RANGE are set.
 """
 

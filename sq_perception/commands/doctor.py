@@ -1,4 +1,4 @@
-"""``sq-perception doctor``: versions, extras, kernels, weights and cores, and what to do about what is missing."""
+"""``sq-perception doctor``: versions, extras, kernels, weights and cores, and how to install what is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``sq-perception grasp``: recorded frames in; grasps of what is on the table out, as JSON, pictures and meshes."""
+"""``sq-perception grasp``: recorded frames in; grasps out, as JSON, pictures and meshes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``sq-perception grasp`` does with its frames: recover, plan, and write JSON, pictures and meshes."""
+"""The run of ``sq-perception grasp``: recover, plan, and write JSON, pictures and meshes."""
 
 from __future__ import annotations
 

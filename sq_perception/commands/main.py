@@ -1,9 +1,9 @@
-"""The command ``sq-perception``; ``sq-perception --help`` lists what it can do.
+"""The command ``sq-perception``; ``sq-perception --help`` lists its commands.
 
-Every command is a function of a module, ``(arguments) -> exit code``.  None is imported before it is called, and each
-imports what computes only after its arguments were understood, so that every ``--help`` answers at once.
+Every command is a function of a module, ``(arguments) -> exit code``.  It is imported when it is called, and imports
+numeric modules only after parsing its arguments, so that every ``--help`` answers at once.
 
-Exit codes: 0 all went well, 1 something could not be read, written or found, 2 wrong usage, 130 interrupted.
+Exit codes: 0 success, 1 something could not be read, written or found, 2 wrong usage, 130 interrupted.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
 
-Whether everything can be written is known before the first frame is read, and what was there before is kept until there
-is something better (:mod:`sq_perception.commands.recover_outputs`).
+Outputs are checked before the first frame is read, and existing files are kept until a complete result replaces them
+(:mod:`sq_perception.commands.recover_outputs`).
 """
 
 from __future__ import annotations

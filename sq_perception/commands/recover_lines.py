@@ -1,8 +1,8 @@
-"""What ``sq-perception recover`` prints of the frames: a line a body, each reason once, details where they are wanted.
+"""The lines that ``sq-perception recover`` prints: one per body, each reason once, details on request.
 
     0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m
 
-The number is the body's place in ``superquadrics``, as in meshes and pictures.
+The number is the body's index in ``superquadrics``, as in meshes and pictures.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""The files that ``sq-perception recover`` writes: looked at before the first frame, and finished after the last one.
+"""The files that ``sq-perception recover`` writes: checked before the first frame, and finished after the last one.
 
-What is wrong with a name comes back as a sentence; :mod:`sq_perception.files.output_file` is how files are replaced.
+Errors of names are returned as sentences; :mod:`sq_perception.files.output_file` replaces files.
 """
 
 from __future__ import annotations

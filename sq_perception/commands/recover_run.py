@@ -1,4 +1,4 @@
-"""One pass of ``sq-perception recover`` over its frames, and its summary."""
+"""The run of ``sq-perception recover`` over its frames, and its summary."""
 
 from __future__ import annotations
 

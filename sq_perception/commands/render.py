@@ -1,4 +1,4 @@
-"""``sq-perception render``: one superquadric as a depth image, with the camera that saw it."""
+"""``sq-perception render``: one superquadric as a depth image, with its camera."""
 
 from __future__ import annotations
 

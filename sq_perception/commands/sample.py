@@ -1,4 +1,4 @@
-"""``sq-perception sample``: a simulated frame to begin with, and what is in it."""
+"""``sq-perception sample``: a simulated frame and its true bodies."""
 
 from __future__ import annotations
 

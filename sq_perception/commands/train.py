@@ -1,4 +1,4 @@
-"""``sq-perception train``: run a training, or go on with one."""
+"""``sq-perception train``: run or continue a training."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""``sq-perception warm-up``: compile every kernel once and keep it on disk, so that no first image has to wait.
+"""``sq-perception warm-up``: compile every kernel and keep it on disk, so that the first image does not wait.
 
-Compiled code is kept beside the modules, or in the user's cache where that folder cannot be written.
+Compiled code is kept beside the modules, or in the user's cache if that folder cannot be written.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The node of ``sq-perception demo``: collects images, their true bodies, and what two nodes find in them."""
+"""The node of ``sq-perception demo``: collects images, their true bodies, and the results of two nodes."""
 
 from __future__ import annotations
 

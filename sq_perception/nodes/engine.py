@@ -1,11 +1,11 @@
-"""The recoverer of a frame node: made in a thread of its own, swapped as a whole, shared by the nodes of a process.
+"""The recoverer of a frame node: made in its own thread, replaced as a whole, shared by the nodes of a process.
 
-A change of the parameters that a recoverer is made of (model, device ...) makes another one in a thread of its own,
-warmed up before it is used.  Frames go on with the old one, and with those parameters as they were, until the new one
-is ready.  One that cannot be made leaves the old one at work, and :attr:`Engine.fault` has the reason.
+After a change of its parameters (model, device ...) a new recoverer is made and warmed up in its own thread.  Frames
+use the old one, with the old parameters, until the new one is ready.  If it cannot be made, the old one stays active
+and :attr:`Engine.fault` has the reason.
 
-Nodes of one process that ask for equal recoverers get one.  One frame is computed at a time in a process, in the order
-of asking (:class:`Turns`): a frame already uses every core, two at once would each take twice as long.
+Nodes of one process share equal recoverers.  A process computes one frame at a time, in the order of requests
+(:class:`Turns`): a frame already uses every core, so two at once would each take twice as long.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The programs of ``ros2 run sq_perception``: one function each, which returns the exit code.
 
 Each imports its node inside :func:`sq_perception.nodes.process.run`: numba and rclpy take seconds to import, and
-a Ctrl-C meanwhile must end the process without a traceback.
+a Ctrl-C during that time must end the process without a traceback.
 """
 
 # ruff: noqa: E402 - the imports below take long enough for a Ctrl-C

@@ -1,13 +1,13 @@
-"""Fast DDS: the profile that keeps large images from getting lost, and the shared memory that killed processes leave.
+"""Fast DDS: the profile that prevents the loss of large images, and the shared memory that killed processes leave.
 
-Fast DDS 2, that of Jazzy, reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so
-that the variable must be set before rclpy.init.  A file that the user has chosen is left alone.  Its successor's name,
-FASTDDS_DEFAULT_PROFILES_FILE, means nothing to it.
+Fast DDS 2 of Jazzy reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so the
+variable must be set before rclpy.init.  A user's file is kept.  It ignores its successor's variable,
+FASTDDS_DEFAULT_PROFILES_FILE.
 
 It keeps one segment per participant in /dev/shm, ``fastrtps_<16 hex digits>``, 17 MB with this profile, whose owner
-holds a lock on ``fastrtps_<16 hex digits>_el`` for as long as it lives.  After kill -9 the kernel frees the lock, but
-nothing frees the segment (docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test that ``fastdds shm
-clean`` applies; as these are files of the middleware's, nodes call it only with ``free_shared_memory``.
+holds a lock on ``fastrtps_<16 hex digits>_el`` while it lives.  After kill -9 the kernel frees the lock, but nothing
+frees the segment (docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test of ``fastdds shm clean``;
+since they belong to the middleware, nodes call it only with ``free_shared_memory``.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""A depth image on its way through a node: decoded from its message, and back into messages like it.
+"""Decoding of depth image messages, and encoding of depth as messages of the same kind.
 
-The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``; how such messages are
-listened to is here too.
+The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``; their quality of
+service is here too.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
 """The node behind recover_node and fitter_node: depth images in, superquadrics out; its topics are in docs/nodes.md.
 
-The way of an image, each room entered once:
+The stages of an image:
 
     input.Input -> frame.decode -> engine.Engine.recover -> tracking.Tracking.identify -> outputs.Outputs.answer
 
-The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
-parameters answer at once.  Every output has the stamp of the input.  Results of orthographic frames are in the cube
-frame of :mod:`sq_perception.imaging.unit_cube`, others in the optical frame or ``target_frame``.
+The executor's thread only stores messages; one worker thread processes the newest, so that services and parameters
+respond at once.  Every output has the stamp of the input.  Results of orthographic frames are in the cube frame of
+:mod:`sq_perception.imaging.unit_cube`, others in the optical frame or ``target_frame``.
 
 A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
-subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
+subscribes, deactivating unsubscribes after the current frame, cleaning up frees the network's memory.
 """
 
 from __future__ import annotations

@@ -1,16 +1,15 @@
 """grasp_node: superquadrics in, grasps of a parallel gripper out; its topics are in docs/grasping.md.
 
-All outputs have the header of the cloud.  The last plane in its frame counts, also where a camera has moved with that
-frame since; without one, grippers come from the side of the frame's origin: of the camera, or of ``target_frame``.
-What no message holds, measured points and unseen space, is not looked at; the command ``sq-perception grasp`` does.
-Correlations of a body's numbers are not in the cloud either.  Nor is it told from the cloud whether it is in metres:
-one in the frame ``unit_cube`` is refused, no other one of orthographic images.
+All outputs have the header of the cloud.  The last plane in its frame is used, even if the camera has moved with that
+frame since; without a plane, grippers approach from the side of the frame's origin: the camera, or ``target_frame``.
+Measured points, unseen space and correlations are in no message and so ignored, unlike in ``sq-perception grasp``.  The
+cloud does not say whether it is in metres: of clouds from orthographic images, only the frame ``unit_cube`` is refused.
 
-``~/plan`` and ``~/plan_grasps`` plan the last cloud again, unless it is older than ``max_age``: where a camera has
+``~/plan`` and ``~/plan_grasps`` plan on the last cloud again, unless it is older than ``max_age``: if the camera has
 stopped, the bodies may be gone.
 
-Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
-target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.
+If moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp for the body whose
+collision object is the target's id, or for all bodies without an id.  Other fields of the request are ignored.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
-"""The input of a frame node: what it hears, what waits for the worker, and the frames that are made of it.
+"""The input of a frame node: its subscriptions, the images that wait for the worker, and their frames.
 
-Callbacks of the executor store, one worker thread takes; the newest complete depth image wins.  It is complete with the
-camera_info of its own stamp, or else the latest one of its size, and, where masks are expected, with the mask of its
-own stamp.  What is missing may come within ``patience`` seconds, in which newer images come too: nobody who has the
-turn to compute waits for a message, and a frame has its mask though the network that makes it is slower than the
-camera.  As soon as an image is complete, or its patience is at an end, it takes the place of every older one.
+Callbacks of the executor store messages; one worker thread takes the newest complete depth image.  An image is complete
+with the camera_info of its stamp, or else the latest of its size, and, if masks are expected, with the mask of its
+stamp.  It waits ``patience`` seconds for them, while newer images arrive: no computation waits for a message, and a
+frame gets its mask even if the network that makes it is slower than the camera.  Once an image is complete, or its
+patience has expired, it replaces every older one.
 """
 
 from __future__ import annotations

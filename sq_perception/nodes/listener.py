@@ -1,11 +1,11 @@
-"""A subscription that is as reliable as the publishers of its topic let it be, and that says whom it hears.
+"""A subscription that is as reliable as the publishers of its topic allow, and that lists the publishers.
 
-Keep last 1.  Best effort hears every publisher, but large messages that do not fit into the publisher's shared memory
-are lost: of VGA depth images, four in five.  A reliable subscription loses none, but does not hear a publisher that is
-best effort.  So a listener is reliable while all publishers of its topic are, and best effort otherwise; it looks again
-when one comes or goes.  DDS cannot change a live subscription: another one takes its place, and both listen while the
-publishers find it, so that no message is lost; one that both hear is passed on once.  Where
-``qos_overrides.<topic>.subscription.reliability`` is reliable or best_effort, that is kept.
+Keep last 1.  A best effort subscription receives every publisher, but loses large messages that do not fit into the
+publisher's shared memory: of VGA depth images, four in five.  A reliable subscription loses none, but receives no best
+effort publisher.  So a listener is reliable while all publishers of its topic are, and best effort otherwise; it checks
+again when one appears or leaves.  DDS cannot change a live subscription: a new one replaces it, and both listen until
+the publishers have found it, so that no message is lost; duplicates are passed on once.  If
+``qos_overrides.<topic>.subscription.reliability`` is reliable or best_effort, that takes precedence.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, followed while the node runs.
+"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, updated at run time.
 
 Each field of such a dataclass is one parameter of the same name; :func:`setting` carries its descriptor:
 meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them

@@ -1,21 +1,20 @@
-"""A lifecycle node that brings itself up, does its transitions in a thread of its own, and reports why one failed.
+"""A lifecycle node that can start itself, runs its transitions in their own thread, and reports why one failed.
 
     unconfigured --configure--> inactive --activate--> active
          ^  ^---------cleanup------'  ^----deactivate----'
-         '---- errorprocessing <---- whatever raises in a transition, or a fault while active
+         '---- errorprocessing <---- an exception in a transition, or a fault while active
 
 Started by :meth:`ManagedNode.start` it configures and activates itself, so that plain ``ros2 run`` works without a
 manager.  A transition that takes seconds, such as loading a model, leaves the executor free: services answer meanwhile.
 
-What a subclass does in a transition it does in :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and
-:meth:`_cleanup`; any exception leads through ``errorprocessing``, where everything is released, to ``unconfigured``,
-from where the node can be configured again.  :attr:`fault` is the reason until it succeeds.  A fault while active
-(:meth:`_fail`) takes the same way; a node that started itself comes back after a pause, or ends its process if it
-cannot.
+A subclass implements :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and :meth:`_cleanup`; any exception
+leads through ``errorprocessing``, where everything is released, to ``unconfigured``, from where the node can be
+configured again.  :attr:`fault` is the reason until that succeeds.  A fault while active (:meth:`_fail`) does the same;
+a node that started itself restarts after a pause, or ends its process if it cannot.
 
 Transitions create and destroy publishers and subscriptions outside of the executor's thread.  rclpy's executors may
-raise InvalidHandle then (ros2/rclpy issue 1284), which :mod:`sq_perception.nodes.process` takes for nothing; a program
-with an executor of its own does the same.
+then raise InvalidHandle (ros2/rclpy issue 1284), which :mod:`sq_perception.nodes.process` ignores; programs with their
+own executor must do so too.
 
 Reference: https://design.ros2.org/articles/node_lifecycle.html
 """

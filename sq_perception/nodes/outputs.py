@@ -1,15 +1,15 @@
-"""What a frame node publishes of a frame's bodies: the point cloud, pictures, and what other stacks understand.
+"""The outputs of a frame node: point cloud, pictures, and messages for other stacks.
 
-The point cloud is the answer to a frame; what goes with it comes afterwards and cannot take the answer back.  Messages
-of tf2_msgs, vision_msgs and moveit_msgs are not on PyPI, and a robot may lack each: a package is imported only when its
-output is asked for, and one that is missing is named once in the log and stays in ``absent``.
+The point cloud is published first and does not depend on the other outputs.  tf2_msgs, vision_msgs and moveit_msgs are
+not on PyPI and may be missing on a robot: each is imported only when its output is enabled; a missing one is named once
+in the log and listed in ``absent``.
 
-/tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
-tf2_msgs alone, knows whether anybody listens, and can be taken down again.
+/tf is published like tf2_ros.TransformBroadcaster does, with the same queue of 100; our own publisher needs only
+tf2_msgs, knows its subscribers, and can be destroyed.
 
-The planning scene is sent again when another planner listens, and from time to time.  Switching it off removes all
-objects that were added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera
-fails; and what planners know outlives a restart after a fault, so that an object that is gone is still removed.
+The planning scene is sent again when another planner subscribes, and periodically.  Switching it off removes all added
+objects.  A node that exits removes nothing: a planner must not lose its obstacles because a camera fails.  The record
+of added objects survives a restart after a fault, so that vanished objects are still removed.
 """
 
 from __future__ import annotations

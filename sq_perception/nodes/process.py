@@ -1,12 +1,12 @@
-"""The life of a process with one or several nodes: start, spin, stop, each without a traceback.
+"""The process of one or several nodes: start, spin and stop without a traceback.
 
-Exit code 0 after Ctrl-C, SIGTERM or the end of the terminal, once, twice, or while a node still starts; 1 with one line
-of explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.  One
-thread spins all nodes: their callbacks only store messages, the work is done in threads of their own.
+Exit code 0 after Ctrl-C, SIGTERM or the end of the terminal, also twice or while a node starts; 1 with one line of
+explanation if a node cannot start.  The shipped Fast DDS profile is used unless the user has set one.  One thread spins
+all nodes: callbacks only store messages, other threads do the work.
 
-Garbage collection: numba and SciPy make 100 000 objects that live as long as the process.  While they are imported,
-260 collections find next to nothing and take 0.13 of 1.1 seconds; later each full collection would take 60 ms, in the
-middle of some frame.  So there is none while a node starts, and afterwards none of what the start made.
+Garbage collection: numba and SciPy make 100 000 objects that live as long as the process.  During their import 260
+collections would free almost nothing and take 0.13 of 1.1 seconds; later each full collection would take 60 ms, in the
+middle of a frame.  So collection is off while a node starts, and later excludes the objects of the start.
 """
 
 from __future__ import annotations

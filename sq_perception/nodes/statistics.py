@@ -1,7 +1,7 @@
 """Counts and latencies of a node, and their summary for diagnostics.
 
 Every received frame ends as exactly one of answered, dropped (a newer one came first, or the node is disabled) and
-refused (bad input); the rest is in work.  Counts are since the start, rates and latencies of the last seconds.
+refused (bad input); the rest is in progress.  Counts run from the start; rates and latencies cover the last seconds.
 """
 
 from __future__ import annotations

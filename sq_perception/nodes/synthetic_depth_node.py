@@ -7,8 +7,8 @@
 | `mask/image` | sensor_msgs/Image | out: label images (16UC1), where recordings have them or they are asked for |
 | `~/truth` | sensor_msgs/PointCloud2 | out: the bodies of generated scenes, in the message of the recovery |
 
-All carry the same stamp and frame.  Publishers are reliable, which best effort subscribers hear too.  The image goes
-last: whoever has it has the rest.
+All have the same stamp and frame.  Publishers are reliable, so best effort subscribers receive them too.  The image is
+published last: whoever has it has the rest.
 """
 
 from __future__ import annotations

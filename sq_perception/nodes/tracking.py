@@ -1,7 +1,7 @@
-"""Which track each body of a frame belongs to, in the camera's frame or a fixed one, and what is published of it.
+"""Tracks of the bodies of each frame, in the camera's frame or a fixed one, and their published numbers.
 
-tf2_ros comes with a ROS installation and is not on PyPI: it is imported, and /tf listened to, only once a frame is
-asked for.  A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
+tf2_ros comes with a ROS installation and is not on PyPI: it is imported, and /tf subscribed to, only once a frame is
+requested.  A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
 """
 
 from __future__ import annotations
