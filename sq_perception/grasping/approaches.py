@@ -1,10 +1,10 @@
 """Approaches of a parallel gripper to a body, and the places of its pads along them.
 
-A closing is a direction y along which a body is narrow enough and whose opposite surfaces are met squarely.  The hand
-approaches along z, perpendicular to y: as steeply as possible, or swung about y.  With x the cross product of y and z
-the TCP is at
+A closing is a direction y along which a body is narrow enough and whose opposite surfaces the pads meet squarely.  The
+hand approaches along z, perpendicular to y: as steeply as possible, or rotated about y.  With x the cross product of y
+and z the TCP is at
 
-    t + u z + v x,    t the body's centre, u how far ahead of it (deepest, shallow, between), v how far along it.
+    t + u z + v x,    t the body's centre, u the depth (deepest, shallow, between), v the slide along the body.
 
 Metres, in the frame of the bodies.
 """

@@ -1,13 +1,13 @@
-"""How far a gripper stays from everything: other bodies, the table, measured points.
+"""Clearance of a gripper from other bodies, the table and measured points.
 
-Two convex sets are apart by at least the gap along any direction n,
+The distance of two convex sets is at least the gap along any direction n,
 
     gap(n) = n.(c_body - c_box) - h_body(-n) - h_box(n),
 
 with the support functions h of body and box in closed form.  The greatest gap over some directions is a lower bound of
-their distance: towards the body's centre from the box's nearest point, and along the axes of both.  It is negative
-where none of them parts the two: a collision, or at worst a near miss that is taken for one.  Likewise the distance of
-a point inside a box is negative: by how much it would have to move to leave it.
+the distance: towards the body's centre from the box's nearest point, and along the axes of both.  It is negative if no
+direction separates them: a collision, or at worst a near miss.  Likewise the distance of a point inside a box is
+negative: how far it would have to move to leave it.
 
 Boxes are those of :meth:`Gripper.boxes`.  Metres.
 """

@@ -1,17 +1,17 @@
-"""Where two flat jaws may close on a superquadric: widths, contacts and how sure they are, in closed form.
+"""Closing two flat jaws on a superquadric: widths, contacts and their uncertainty, in closed form.
 
 A body with the support function h and the centre t spans along a unit direction n from n.t - h(n) to n.t + h(n): the
-opening for jaws that close along n is 2 h(n).  A superquadric is centrally symmetric, so that the chord through c + t
-along n leaves it at two points; both lie in the friction cone of jaws that close along n where the normals there are
-no farther than atan(mu) from +-n.  Along the axes this is so exactly, and on a round body in the whole circle around
-its axis.  Tried are the axes and twelve directions in each plane of two axes.
+opening for jaws that close along n is 2 h(n).  A superquadric is centrally symmetric, so the chord through c + t
+along n leaves it at two points; both lie in the friction cone of the jaws if the normals there are within atan(mu)
+of +-n.  Along the axes this holds exactly, and for a round body in the whole circle around its axis.  The candidates
+are the axes and twelve directions in each plane of two axes.
 
-How sure a reach E(n) = n.t + h(n) is follows from the covariance C of the body to first order,
+The variance of a reach E(n) = n.t + h(n) follows from the covariance C of the body to first order,
 
     sigma^2 = g^T C g,   g = dE / d(a1 a2 a3, t, w) = (|m| dh/d(a |m|), n, p x m),
 
 with m = R^T n, p the body's point farthest along m and w the turn in the body's frame.  Along the axes E does not
-depend on the exponents; beside them the little that it does is left out.
+depend on the exponents; in other directions that small effect is neglected.
 
 Metres, in the frame of the bodies.
 """

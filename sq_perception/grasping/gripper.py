@@ -1,14 +1,14 @@
-"""Parallel grippers as boxes, and where their tool centre point is.
+"""Parallel grippers as boxes, and their tool centre points.
 
 The frame of a grasp is that of the tool centre point, TCP, midway between the pads:
 
-    z   the way of the approach, out of the palm
-    y   the way of the fingers: they close along y, towards each other
+    z   approach direction, out of the palm
+    y   closing direction of the fingers
     x   along the width of a finger
 
 The fingers are boxes |x| <= finger_width / 2, opening / 2 <= |y| <= opening / 2 + finger_thickness, -palm <= z <= tip;
-the hand is a box behind them, z <= -palm, and so long and wide that it holds the way of the approach as well, its own
-and that of the fingers.  Metres, newtons.
+the hand is a box behind them, z <= -palm, long and wide enough to cover the approach path of hand and fingers as well.
+Metres, newtons.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a plan of grasps is made of.
+"""Grasps and plans of grasps.
 
 The pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame of the bodies; metres.
 """

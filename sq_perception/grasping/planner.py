@@ -2,7 +2,7 @@
 
     P = product over k of Phi(m_k / sigma_k)
 
-Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it is:
+Every margin m_k is a distance or angle to failure, sigma_k its standard deviation:
 
 | margin | of what | sigma |
 | --- | --- | --- |
@@ -12,18 +12,17 @@ Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it
 | friction | the cone's half angle less that between pads and surface | of mu, of the surface's turn |
 | weight | friction of both pads against gravity, as a force and as a torque about the closing line | of the mass |
 | table, bodies, points | the gripper's least distance | of the obstacle where it is nearest, the hand |
-| unseen | share of the fingers in space that nobody has seen | a share of it is taken |
+| unseen | share of the fingers in unobserved space | a share of it is taken as occupied |
 
-Vessels that none of these is sure of are also tried by their rims (:mod:`sq_perception.grasping.rims`).
+Vessels without a safe grasp are also tried by their rims (:mod:`sq_perception.grasping.rims`).
 
-The opening is the body's width and, on either side, a clearance and twice the sigma of that side; less where the
-gripper opens no wider.  The hand stands farther from the side that is less sure.  A side that was not seen is
-uncertain, so that a body of unknown depth is taken by its known sides.  The hand comes to be where it is sent to but
-for the error of its calibration.  How far real things stray from superquadrics is in the covariance of a fit already.
-Where the image shows that the place of a pad, or of the palm between the fingers, is empty, there is no body: its sides
-and its near end count by the share of that place which is hidden, and the distance of measured points tells the rest.
-Margins are taken as independent of each other, except that of measured points: these are points of the bodies, so that
-only what it takes beyond opening, palm and other bodies counts.
+The opening is the body's width plus, on either side, a clearance and twice the sigma of that side, limited by the
+gripper.  The hand keeps farther from the less certain side.  Unseen sides are uncertain, so a body of unknown depth is
+gripped by its known sides.  The hand's error is that of its calibration.  The covariance of a fit already contains how
+far real objects deviate from superquadrics.  Where the image shows that the place of a pad, or of the palm between
+the fingers, is empty, there is no body: sides and near end count by the hidden share of that place, and the distance
+of measured points covers the rest.  Margins are treated as independent, except that of measured points: these belong
+to the bodies, so only what it adds to opening, palm and other bodies counts.
 
 Metres, newtons, kilograms; the pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame
 of the bodies.

@@ -1,11 +1,11 @@
 """Grasps of open vessels by their rim: one finger inside, one outside, down along their upright axis.
 
-Bodies are convex and know of no cavity, measured points do.  At a bearing around a body the rim is what was measured
-within some millimetres of the highest points there, if that is as thin as a wall.  There is a cavity behind it if the
-image shows something farther away than the places where the end of the inner finger comes to be.
+Bodies are convex and have no cavity, so rims come from measured points.  At a bearing around a body the rim consists of
+the points within some millimetres of the highest ones, if they are as thin as a wall.  There is a cavity behind it if
+the image shows something beyond the place of the inner finger's end.
 
-The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh a share of what a
-full body would; the pads hold their torque about the tangent by as much as they overlap.
+The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh a share of a full
+body; the pads resist torque about the tangent by their overlap.
 
 Metres, in the frame of the bodies.
 """

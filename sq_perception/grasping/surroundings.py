@@ -1,4 +1,4 @@
-"""What surrounds the bodies: the table, other measured points, and space that was not seen."""
+"""The surroundings of the bodies: the table, other measured points, and unseen space."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Candidate grasps: the probabilities of their margins, and what all ways of grasping have in common.
+"""Candidate grasps: the probabilities of their margins, and common functions of all kinds of grasps.
 
 Metres, newtons, kilograms.
 """
