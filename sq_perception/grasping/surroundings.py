@@ -33,7 +33,7 @@ class Surroundings:
     plane : (4,), optional
         What the bodies stand on: the height above it is n.p + d, n up and of length 1.
     points : (j, 3)
-        Measured points of things; the table's are not among them.
+        Measured points of objects; the table's are not among them.
     depth, camera
         A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical
         one: what lies behind what it shows has not been seen.

@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 DENSITY = 500.0
-"""Density of things, kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
+"""Density of objects, kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 CLEARANCE = 0.005
 """Clearance on either side of the body and before the palm, metres."""
 LEAST_ENGAGED = 0.004
 """Least length of finger beyond the near end, metres."""
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
-"""Standard deviation, metres, to which thinned points tell where a thing's side is that the image shows a finger to
+"""Standard deviation, metres, to which thinned points tell where an object's side is that the image shows a finger to
 pass: of 247 such sides, 3.3 mm with the 2 mm of the hand (30 scenes of benchmarks/picking.py from seed 30010 on)."""
 PASSES = 0.001
-"""Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
-(60 household things in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
+"""Metres by which a finger may come down on the edge of an object: half of those that did passed it and pushed it aside
+(60 household objects in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
 NEARER = 0.4
 """Sigmas by which sides are nearer than fits say, of 797 tried ones that were known to more than 3.5 mm: medians of 0.3
 to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where

@@ -24,7 +24,7 @@ from sq_perception.simulation.thing import (
 )
 
 _OVERLAP, _EDGE = 0.56, 0.1
-"""Half height of the slabs that revolved things are stacked of, in their distance, and e1: where two meet, the surface
+"""Half height of the slabs that revolved objects are stacked of, in their distance, and e1: where two meet, the surface
 is 0.6 % nearer to the axis."""
 _LEVELS = 100
 """At which a cavity is looked at."""

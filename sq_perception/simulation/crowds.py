@@ -1,4 +1,4 @@
-"""Crowds: random superquadrics on a table that lean on each other and hide each other.
+"""Crowds: random superquadrics on a table that touch and occlude each other.
 
 Most bodies are pushed along the table against another one until they touch.  Convex bodies A and B overlap where a
 point of one's surface lies inside the other; the push ends where no sampled point does any more.

@@ -1,8 +1,8 @@
-"""Household things as they are: unions of superquadrics of household proportions.
+"""Household objects: unions of superquadrics of household proportions.
 
-A :class:`~sq_perception.simulation.thing.Thing` is drawn by its kind; bottles and vessels have a module of their own.
+A :class:`~sq_perception.simulation.thing.Thing` is drawn by its kind; bottles and vessels have their own module.
 
-Families and their measures (ranges are wider than the sources: things differ)
+Families and their measures (ranges are wider than the sources: objects differ)
 ------------------------------------------------------------------------------
 | kind | what | measures |
 | --- | --- | --- |
@@ -17,7 +17,7 @@ Families and their measures (ranges are wider than the sources: things differ)
 
 Sources: EN 10333 and the can makers' common diameters (52, 53, 58, 66, 73, 83, 99 mm), ISBT finishes of PET bottles
 (PCO 1881, 38 mm), 0.25 to 2 l bottles of water, oil, cleaner and shampoo as sold, ISO 216, ISO 12757 (pens), UNECE
-standards for fruit, table ware of hotel catalogues.  No object of a benchmark is among them.
+standards for fruit, table ware of hotel catalogues.  Benchmark objects are not among them.
 """
 
 from __future__ import annotations

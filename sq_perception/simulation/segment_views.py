@@ -1,20 +1,18 @@
-"""Segments of simulated scenes, with which of their readings are of their object: training data.
+"""Segments of simulated scenes, with the truth of which readings belong to their object: training data.
 
-Things on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
-(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or crowds
-of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by a known sensor or by
-one of random parameters (:mod:`~sq_perception.simulation.thing_sensing`); of many a smaller image is taken, whose
-borders cut things.  It is segmented as any image is, and each segment seen as a
-:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the thing that most of its pixels show; what
-shows the table, the furniture or the room at half of its pixels, and no thing at 30 % of them, has none.  A reading is
-one of the object if its pixel shows the object and it is no more than 10 mm + 1 % off: what a sensor smears over an
-edge is not.
+Objects on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
+(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or
+crowds of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by a known
+sensor or by a random one (:mod:`~sq_perception.simulation.thing_sensing`); many images are cropped, so that their
+borders cut objects.  Each image is segmented as in recovery, and each segment becomes a
+:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the one that most of its pixels show; a
+segment that shows table, furniture or room at half of its pixels, and no object at 30 % of them, has none.  A reading
+belongs to the object if its pixel shows the object and its error is at most 10 mm + 1 %, which excludes smeared
+edges.
 
-The network that learns from them is also asked whether a segment is one thing, so compact pieces of segments
-(:mod:`~sq_perception.segmentation.pieces`) are among them, and of two neighbours as if they were one, each with the
-thing that it shows; the rest of the segment is other segments.  Of a segment that shows several things there is each
-one's part.
-"""
+The network also learns whether a segment is one object.  So the views include compact pieces of segments
+(:mod:`~sq_perception.segmentation.pieces`) and of two merged neighbours, each with the object that it shows; the rest
+of the segment counts as other segments.  For a segment of several objects there is a view of each one's part. """
 
 from __future__ import annotations
 
@@ -47,24 +45,24 @@ _CROWDS, _IN_FURNITURE = 0.2, 0.3
 _WITH_ROOM = 0.6
 """Share of the other scenes whose table ends in sight, before a room."""
 _LARGER, _TIMES = 0.35, (1.0, 2.5)
-"""Share of the scenes that are as if all of it were so many times as large and as far: the largest thing that is
+"""Share of the scenes that are as if all of it were so many times as large and as far: the largest object that is
 recovered is 0.6 m long, and what is none is not told by its size."""
 _SMALLER, _SIDES = 0.6, (0.35, 0.9)
 """Share of the scenes of which a smaller image is taken, and its sides in those of the whole one."""
 _OFF, _OFF_SHARE = 0.01, 0.01
 """Metres, and share of the depth: by less than their sum a reading is off that counts as one of what it shows."""
 _MOSTLY_NOTHING, _SOME_THING = 0.5, 0.3
-"""Shares of a segment's pixels: it has no object if so many show no thing, and no more than so many show one thing."""
+"""Shares of a segment's pixels: it has no object if the first share shows none and at most the second shows one."""
 _LEAST_CELLS = 8
 """Measured cells of a segment: views with fewer are left out."""
 _SMEARED, _NO_OBJECT = -1, -2
-"""In place of a thing's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
+"""In place of an object's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
 _PIECES = (3, 7)
 """Pieces that a segment is cut into: from, and below."""
 _PURE = 0.7
-"""Share of a piece's readings that show one thing: others have no object."""
+"""Share of a piece's readings that show one object: others have no object."""
 _PART = 0.1
-"""Share of a segment from which on what shows one of several things is seen by itself as well."""
+"""Share of a segment from which on what shows one of several objects is seen by itself as well."""
 _TWO_AS_ONE, _BESIDE = 0.3, np.ones((7, 7), np.uint8)
 """Share of the segments that are seen as one with a neighbour within three pixels."""
 

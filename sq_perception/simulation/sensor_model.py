@@ -1,4 +1,4 @@
-"""What every model of a depth sensor offers; see :mod:`sq_perception.simulation.sensor_noise` for the sensors."""
+"""The interface of depth sensor models; :mod:`sq_perception.simulation.sensor_noise` has the sensors."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""A household thing: a union of superquadrics with its ways to rest, and what families of things are built of.
+"""A household object: a union of superquadrics with its resting poses, and building blocks of object families.
 
-A thing is a union of superquadrics in its own frame: metres, z up when it stands, the middle of its box at the origin.
-What a planner needs of it, its convex hull, has the support function
+An object is a union of superquadrics in its own frame: metres, z up when it stands, box centre at the origin.
+Its convex hull, which planners need, has the support function
 
     h(n) = max over the parts of  n.t + h_part(R^T n),
 
-closed form through :meth:`Superquadric.support`.  An open vessel has cavities besides, superquadrics that are cut away
-from the union; its hull does not know them.
+in closed form by :meth:`Superquadric.support`.  An open vessel also has cavities, superquadrics that are removed from
+the union; the hull ignores them.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
-"""The thing's x axis points up: it lies on a side."""
+"""The object's x axis points up: it lies on a side."""
 ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
-"""The thing's y axis, of an oval bottle the shorter one, points up."""
+"""The object's y axis, of an oval bottle the shorter one, points up."""
 INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
 
 SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
@@ -64,7 +64,7 @@ class Thing:
     name : str
         The family within the kind.
     parts : Superquadric
-        Batch (k,) in the thing's own frame, metres.
+        Batch (k,) in the object's own frame, metres.
     rests : tuple of Rest
         How it may lie; their probabilities add up to 1.
     cavities : Superquadric
@@ -93,7 +93,7 @@ class Thing:
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
         """Draw a resting pose, turned about the vertical: its name and the quaternion (4,) to a frame with z up.
 
-        ``leaning`` is the share of things that are tilted by 4 to 35 degrees, as by something under or beside them.
+        ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them.
         """
         rest = self.rests[one_of([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn

@@ -1,9 +1,9 @@
-"""What random depth sensors report of a simulated thing: errors, and readings that are missing.
+"""Measurements of a simulated object by random depth sensors: errors and missing readings.
 
 One of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline on either side,
 fattened or mixed or wandering edges, lost grazing sides.  Besides, in some images: waves, a side that is lost as one
-eye hardly sees it, lost edges, contours, dark blobs and bands, things that are lost but for patches, smoothing.  In
-half of them what is missing beside the thing is filled with what is there.  Last come the camera's
+eye hardly sees it, lost edges, contours, dark blobs and bands, objects that are lost but for patches, smoothing.  In
+half of them what is missing beside the object is filled with what is there.  Last come the camera's
 :mod:`~sq_perception.simulation.camera_stages`.
 
 Depth in metres.
@@ -21,7 +21,7 @@ from sq_perception.simulation.camera_stages import Stages, temporal
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 
 _SHINING = 0.08
-"""Share of the images whose things are lost but for patches.  Of household things that are half visible, 4 % are
+"""Share of the images whose objects are lost but for patches.  Of household objects that are half visible, 4 % are
 measured at less than half of their pixels."""
 
 

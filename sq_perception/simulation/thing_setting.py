@@ -1,9 +1,9 @@
-"""A thing before a camera, in a random pose with what is around it; metres, optical frame unless noted.
+"""An object before a camera, in a random pose with surroundings; metres, optical frame unless noted.
 
 pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
-camera      sees the thing from 20 to 70 degrees above the table, in a quarter from 65 to 90 (many robots' cameras look
+camera      sees the object from 20 to 70 degrees above the table, in a quarter from 65 to 90 (many robots' cameras look
             straight down), in a fifth from 3 to 25; a roll of some degrees; off the image's middle by up to 27 degrees;
-            0.35 to 2 m away; the thing is 15 to 80 pixels wide
+            0.35 to 2 m away; the object is 15 to 80 pixels wide
 around it   up to three neighbours on the table, the table's end, a wall or nothing behind it
 """
 
@@ -21,15 +21,15 @@ from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
 ON_TOP, FREE = 0.15, 0.05
-"""Shares of the views in which the thing stands on something on the table, and in which there is no table."""
+"""Shares of the views in which the object stands on something on the table, and in which there is no table."""
 _ELEVATIONS, _OFTEN = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0)), (0.55, 0.25, 0.2)
 """Degrees, and shares of the views.  Chosen: of a network that saw 0.5 % from above 80 degrees the hulls there erred
 half as much again as those at 20 to 70."""
 _DISTANCE = (0.35, 1.3, 2.0)
 _FARTHEST = 12.0
-"""Diagonals of its box, more than which no thing is away."""
+"""Diagonals of its box, more than which no object is away."""
 _NEAREST = 0.05
-"""Metres before the camera that no thing comes nearer than: long ones are farther away."""
+"""Metres before the camera that no object comes nearer than: long ones are farther away."""
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
 _PIXELS_ACROSS = (15.0, 80.0)
@@ -37,7 +37,7 @@ _OFF_AXIS = (0.5, 0.4)
 _BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 _LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
 _AROUND = 0.7
-"""Half of the image's side over the thing's width."""
+"""Half of the image's side over the object's width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Setting:
     Attributes
     ----------
     parts, cavities : Superquadric
-        The thing's own, batches (k,) and (m,).
+        The object's own, batches (k,) and (m,).
     others : Superquadric
         Batch (j,), j >= 0: neighbours, and what it stands on.
     table : (4,) or None
@@ -56,9 +56,9 @@ class Setting:
         Depth of the wall behind all, +inf without one.
     camera : Camera
     surface : Mesh, optional
-        The thing's surface, if it is seen as a mesh.
+        The object's surface, if it is seen as a mesh.
     height
-        Height above the table of what the thing stands on, metres.
+        Height above the table of what the object stands on, metres.
     """
 
     parts: Superquadric
@@ -140,7 +140,7 @@ def _camera_pose(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Draw the optical from table pose, a quaternion (4,) and a translation (3,), and the object's distance.
 
-    The thing's parts (k, 12) are in its own frame, ``reach`` (6,) is its support in SIX_WAYS there, and ``lift`` (3,)
+    The object's parts (k, 12) are in its own frame, ``reach`` (6,) is its support in SIX_WAYS there, and ``lift`` (3,)
     leads to the table's frame.
     """
     elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))

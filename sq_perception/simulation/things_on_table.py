@@ -1,7 +1,7 @@
-"""Scenes of household things on a table: standing, lying, leaning on each other, stacked, close together.
+"""Scenes of household objects on a table: standing, lying, leaning on each other, stacked, close together.
 
 The table's frame has x to the right, y away from the camera, z up; its origin is the point that the camera looks at,
-from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Things rest in it:
+from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Objects rest in it:
 
     apart       somewhere on the table, at least 3 mm from all others
     beside      pushed along the table against another one until they touch, as seen from above
@@ -41,7 +41,7 @@ ELEVATION = (20.0, 70.0)
 _ROLL = float(np.deg2rad(5.0))
 _WALL = (1.8, 3.5)
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
-"""Tried; many a thing can neither lean nor be stacked where it is tried."""
+"""Tried; many an object can neither lean nor be stacked where it is tried."""
 _GAP = 0.003
 _ALONG = 1e-6
 """Component of a unit vector: what comes no nearer than this to a plane moves along it."""
@@ -67,7 +67,7 @@ class PlacedThing:
     rest
         How it lies, and how it came there.
     rotation, translation : (4,), (3,)
-        Optical from the thing's frame.
+        Optical from the object's frame.
     label
         Its value in the label image.
     pixels
@@ -96,7 +96,7 @@ class ThingsOnTable:
     depth : float64 (height, width)
         +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
     labels : int32 (height, width)
-        True masks, 0 for what is no thing.
+        True masks, 0 for what is no object.
     plane : (4,)
         Height above the table = n.p + d.
     table : (3, 3)
@@ -158,7 +158,7 @@ def things_on_table(
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 8, the camera is no pinhole, or the things find no room in its image.
+        If ``count`` is not 1 to 8, the camera is no pinhole, or the objects find no room in its image.
     """
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")

@@ -1,11 +1,11 @@
-"""Canonical views of known bodies, rendered without the detour over an image: the source of training data.
+"""Canonical views of known bodies, rendered directly without an image: the source of training data.
 
-What :mod:`sq_perception.imaging.canonical_view` makes of an image of a body is rendered directly: rays along z on the
-view's own grid, the view fitted to what of the body is visible.  Frames and values are those of that module.
+The views equal those that :mod:`sq_perception.imaging.canonical_view` makes of images: rays along z on the view's own
+grid, fitted to the visible part of the body.  Frames and values are those of that module.
 
-A canonical view is orthographic whatever camera took the image, but a pinhole camera sees less of a body: of a convex
-one just the points whose normals point to the camera.  So the rays along z, less those that meet a point that faces
-away from it, show what the view of an image with any number of pixels does.
+A canonical view is orthographic for any camera, but a pinhole camera sees less of a body: of a convex one only points
+whose normals point to the camera.  So the rays along z, without those that meet a point facing away from the camera,
+show the same as the view of an image of any resolution.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Occluder(NamedTuple):
         c < u - bow |v - offset|^power < c + thickness,
 
     c such that ``share`` of the body's pixels lie beyond the front.  bow = 0 is a straight edge, power 1 a corner,
-    power 2 a round thing.
+    power 2 a round object.
 
     Attributes
     ----------
