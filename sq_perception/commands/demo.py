@@ -1,6 +1,6 @@
-"""``sq-perception demo``: a simulated camera, recover_node and fitter_node, and how well both methods did.
+"""``sq-perception demo``: a simulated camera, recover_node and fitter_node, and the accuracy of both methods.
 
-The nodes run in this process and talk over ROS 2, in a domain of their own on this machine unless ROS_DOMAIN_ID or
+The nodes run in this process and communicate over ROS 2, in their own domain on this machine unless ROS_DOMAIN_ID or
 ROS_AUTOMATIC_DISCOVERY_RANGE are set.
 """
 
@@ -29,11 +29,11 @@ _SHOWN = """\
 {picture}   the last image: depth, recovered outlines, both methods in space
 {mesh}   the recovered bodies, for any glTF viewer
 What next: `sq-perception sample table.npz`, then `sq-perception recover table.npz --html page.html`; on a robot
-`ros2 run sq_perception recover_node` (README.md has the topics)."""
+`ros2 run sq_perception recover_node` (docs/nodes.md has the topics)."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception demo``; the exit code."""
+    """Run ``sq-perception demo``; return the exit code."""
     command = parser("demo", _HELP)
     add = command.add_argument
     above_0 = number("a number above 0", lambda value: value > 0)
@@ -101,7 +101,7 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
 
 
 def pair(truth: Superquadric, found: Superquadric) -> list[tuple[Superquadric | None, float]]:
-    """For each true body (n,) the found one (m,) that overlaps it most, and their IoU; None where none does."""
+    """Return the best overlapping found body (m,) of each true body (n,) and their IoU; None for no overlap."""
     from sq_perception.geometry.metrics import volume_iou
 
     pairs: list[tuple[Superquadric | None, float]] = []

@@ -1,4 +1,4 @@
-"""What ``sq-perception grasp`` does with its frames: recover, plan, and write JSON, pictures and meshes."""
+"""The run of ``sq-perception grasp``: recover, plan, and write JSON, pictures and meshes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _LONGEST = 10.0
 
 
 def run(options: argparse.Namespace) -> int:
-    """What the command does with these options; the exit code."""
+    """Run the command with these options; return the exit code."""
     kernel_cache.compile_beside()
     try:
         hand = gripper(options.gripper)
@@ -81,7 +81,7 @@ def _plan_all(
     options: argparse.Namespace,
     entries: list[dict[str, Any]],
 ) -> tuple[int, bool]:
-    """Add the elements of ``frames`` to ``entries``; returns the exit code, and whether all frames were tried."""
+    """Append the elements of ``frames`` to ``entries``; return the exit code and whether all frames were tried."""
     code = console.SUCCESS
     stems: set[str] = set()
     try:
@@ -113,7 +113,7 @@ def _plan_all(
 def _bodies(
     stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """The element ``bodies`` of a frame, numbered as by ``recover``; writes its picture and mesh if wanted."""
+    """Return a frame's element ``bodies``, numbered as by ``recover``; write its picture and mesh if requested."""
     settings = RecoveryOptions(free_space=frame.has_free_space)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:
@@ -162,7 +162,7 @@ def _draw(
 
 
 def _write_mesh(path: Path, found: Sequence[Recovery], numbers: Sequence[int], plan: GraspPlan, hand: Gripper) -> None:
-    """Bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
+    """Write the bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
     solids = [recovered.superquadric for recovered in found]
     names = [f"body_{k}" for k in numbers]
     owner = list(numbers)

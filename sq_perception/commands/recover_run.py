@@ -1,4 +1,4 @@
-"""One pass of ``sq-perception recover`` over its frames, and its summary."""
+"""The run of ``sq-perception recover`` over its frames, and its summary."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sq_perception.recovery.still_scene import StillScene
 
 
 def run(options: argparse.Namespace) -> int:
-    """What ``sq-perception recover`` does with these options; the exit code."""
+    """Run ``sq-perception recover`` with these options; return the exit code."""
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
         return reject_usage("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class RecoverRun:
-    """One pass, with these options of the command.
+    """One run with these options of the command.
 
     Attributes
     ----------
@@ -127,7 +127,7 @@ class RecoverRun:
         return Recoverer(options.model, method=options.method)
 
     def over_all_frames(self) -> int:
-        """Recover them; the exit code."""
+        """Recover all frames; return the exit code."""
         try:
             for (file, frame), answer in self._answer(_progress(self._recorded)):
                 try:
@@ -151,11 +151,11 @@ class RecoverRun:
         return FAILURE if self._unreadable else console.SUCCESS
 
     def scene(self) -> list[dict[str, Any]]:
-        """The bodies of all frames together, with camera poses."""
+        """Return the bodies of all frames together, with camera poses."""
         return [result_json.scene_entry(track) for track in self._tracks.scene] if self._tracks else []
 
     def summary(self) -> str:
-        """The run in one line."""
+        """Summarise the run in one line."""
         entries = self.outputs.results
         bodies = [body for entry in entries for body in entry["superquadrics"]]
         failed = sum(body["status"] == "failed" for body in bodies)
@@ -173,7 +173,7 @@ class RecoverRun:
         return workers.Work(frame.depth, frame.camera, frame.labels, settings)
 
     def _answer(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
-        """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
+        """Yield each frame with its recovery or the error it raised; None for what is no frame."""
         executor = self._executor
         if isinstance(executor, workers.Processes):
             works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
@@ -223,7 +223,7 @@ def _count(number: int, singular: str, many: str | None = None) -> str:
 
 
 def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
-    """The frames, with a bar on a terminal where there are several."""
+    """Yield the frames, with a bar on a terminal if there are several."""
     with console.progress() as bar:
         task = bar.add_task("recovering", total=recorded.total, visible=recorded.total > 1)
         for pair in recorded:

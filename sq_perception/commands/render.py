@@ -1,4 +1,4 @@
-"""``sq-perception render``: one superquadric as a depth image, with the camera that saw it."""
+"""``sq-perception render``: one superquadric as a depth image, with its camera."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ files:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception render``; the exit code."""
+    """Run ``sq-perception render``; return the exit code."""
     command = parser("render", _HELP, _EPILOG)
     add = command.add_argument
     for name in PARAMETERS:

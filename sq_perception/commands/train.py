@@ -1,4 +1,4 @@
-"""``sq-perception train``: run a training, or go on with one."""
+"""``sq-perception train``: run or continue a training."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from sq_perception.learning import training_config
 from sq_perception.learning.training_config import CHOICES, TrainingConfig
 
 _HELP = """\
-Train the network, with any loss of the thesis.  Options begin with the values of --config, or with the defaults.
+Train the network with any loss of the thesis.  Defaults of the options come from --config if given.
 
-The output folder holds state.safetensors, from which the same command goes on where it stopped, log.jsonl,
+The output folder holds state.safetensors, from which the same command continues, log.jsonl,
 last.safetensors (the newest validated network) and model.safetensors (the best one so far).
 """
 _EPILOG = """\
@@ -26,7 +26,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train``; the exit code."""
+    """Run ``sq-perception train``; return the exit code."""
     command = parser("train", _HELP, _EPILOG)
     command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
     shipped = ", ".join(training_config.shipped_names())

@@ -1,6 +1,6 @@
-"""``sq-perception warm-up``: compile every kernel once and keep it on disk, so that no first image has to wait.
+"""``sq-perception warm-up``: compile every kernel and keep it on disk, so that the first image does not wait.
 
-Compiled code is kept beside the modules, or in the user's cache where that folder cannot be written.  ``--only`` names
+Compiled code is kept beside the modules, or in the user's cache if that folder cannot be written.  ``--only`` names
 the steps that another process runs at the same time: what a first recovery needs beside the fit.
 """
 
@@ -12,11 +12,11 @@ from collections.abc import Callable, Sequence
 
 from sq_perception.commands.console import SUCCESS, parser
 
-_HELP = "Compile every kernel once and keep it on disk (a minute or two), so that no first image has to wait."
+_HELP = "Compile every kernel once and keep it on disk (a minute or two), so that the first image does not wait."
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception warm-up``: run every step and print how long each took."""
+    """Run ``sq-perception warm-up``: run every step and print how long each took."""
     command = parser("warm-up", _HELP)
     command.add_argument("--only", nargs="+", metavar="STEP", help="of its steps only these")
     only = command.parse_args(arguments).only
@@ -36,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
-    """Name and action of everything that compiles."""
+    """Return name and action of each step that compiles."""
     import numpy as np
 
     from sq_perception.fitting import solina_bajcsy, surface_fit

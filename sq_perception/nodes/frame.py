@@ -1,7 +1,7 @@
-"""A depth image on its way through a node: decoded from its message, and back into messages like it.
+"""Decoding of depth image messages, and encoding of depth as messages of the same kind.
 
-The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``; how such messages are
-listened to is here too.
+The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``; their quality of
+service is here too.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _DIGITS = 3
 
 
 def newest() -> QoSProfile:
-    """Quality of service for images: the newest alone, as with a queue a slow subscriber would answer old ones.
+    """Return the quality of service of images: keep only the newest, as a queue would delay slow subscribers.
 
     Made anew each time, as rclpy writes overrides into it.
     """
@@ -42,13 +42,13 @@ def newest() -> QoSProfile:
 
 
 def latched_qos() -> QoSProfile:
-    """Quality of service for what stays true: who subscribes later gets the last message.  Made anew, likewise."""
+    """Return the quality of service of persistent messages: later subscribers get the last one."""
     return QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A depth image that is fit to be processed.
+    """A depth image that is ready to be processed.
 
     ``depth`` (height, width) is float32, metres in the optical frame, NaN where nothing was measured, rectified as the
     int32 ``labels`` are; ``encoding`` is that of the message before it was packed.  ``has_free_space``: whether a
@@ -66,16 +66,16 @@ class Frame:
 
     @property
     def camera(self) -> Camera:
-        """The pinhole or orthographic camera of the depth."""
+        """The camera of the depth image, pinhole or orthographic."""
         return self.calibration.camera
 
     @property
     def is_cube(self) -> bool:
-        """Whether results belong in the cube frame."""
+        """Whether results are in the cube frame."""
         return not self.camera.is_pinhole
 
     def with_mask(self, message: Image) -> Frame:
-        """The frame with the label image of its objects.  Raises ValueError for one of another size or kind."""
+        """Return the frame with a label image of its objects.  Raises ValueError for a wrong size or encoding."""
         labels = labels_from_message(message)
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
@@ -83,7 +83,7 @@ class Frame:
         return replace(self, labels=self.calibration.rectify_labels(labels))
 
     def encode(self, depth: np.ndarray) -> Image:
-        """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
+        """Encode another depth image (height, width), NaN or inf for no reading, as a message like the frame's own."""
         return publication.depth_message(self.calibration.as_sent(depth), self.header, self.encoding)
 
 
@@ -94,7 +94,7 @@ def decode(
     kind: str = "z",
     view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Frame:
-    """The frame of a depth image message; raises ValueError for anything that keeps it from being processed.
+    """Decode a depth image message; raises ValueError for anything that prevents its processing.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ def decode(
 
 
 def image_topic(node: Node, transport: str) -> str:
-    """The topic to listen to for depth images, with the node's namespace and remappings.
+    """Return the topic of depth images, with the node's namespace and remappings.
 
     The transport's part comes behind the remapped ``depth/image``, unless that names it already.  Points have a topic
     of their own, ``depth/points``, which is remapped by itself.
@@ -160,7 +160,7 @@ def image_topic(node: Node, transport: str) -> str:
 
 
 def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInfo], None]) -> Subscription | None:
-    """Subscribe to a camera_info that was published once and is kept for late comers, if somebody offers one now.
+    """Subscribe to a camera_info that is latched, if a publisher offers one.
 
     Not without looking: a driver that keeps nothing would log an incompatible subscription.
     """
@@ -173,5 +173,5 @@ def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInf
 
 
 def stamp_of(message: Any) -> int:
-    """Nanoseconds of a message's header.  Not by rclpy's Time, which refuses stamps before 1970."""
+    """Return the nanoseconds of a message's header.  Not by rclpy's Time, which refuses stamps before 1970."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)

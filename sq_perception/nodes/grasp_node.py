@@ -1,16 +1,15 @@
 """grasp_node: superquadrics in, grasps of a parallel gripper out; its topics are in docs/grasping.md.
 
-All outputs have the header of the cloud.  The last plane in its frame counts, also where a camera has moved with that
-frame since; without one, grippers come from the side of the frame's origin: of the camera, or of ``target_frame``.
-What no message holds, measured points and unseen space, is not looked at; the command ``sq-perception grasp`` does.
-Correlations of a body's numbers are not in the cloud either.  Nor is it told from the cloud whether it is in metres:
-one in the frame ``unit_cube`` is refused, no other one of orthographic images.
+All outputs have the header of the cloud.  The last plane in its frame is used, even if the camera has moved with that
+frame since; without a plane, grippers approach from the side of the frame's origin: the camera, or ``target_frame``.
+Measured points, unseen space and correlations are in no message and so ignored, unlike in ``sq-perception grasp``.  The
+cloud does not say whether it is in metres: of clouds from orthographic images, only the frame ``unit_cube`` is refused.
 
-``~/plan`` and ``~/plan_grasps`` plan the last cloud again, unless it is older than ``max_age``: where a camera has
+``~/plan`` and ``~/plan_grasps`` plan on the last cloud again, unless it is older than ``max_age``: if the camera has
 stopped, the bodies may be gone.
 
-Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
-target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.
+If moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp for the body whose
+collision object is the target's id, or for all bodies without an id.  Other fields of the request are ignored.
 """
 
 from __future__ import annotations
@@ -56,7 +55,7 @@ _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
 
 
 class GraspNode(ManagedNode):
-    """See the module."""
+    """Node that plans grasps; see the module."""
 
     def __init__(self, name: str, *, context: Any = None) -> None:
         super().__init__(name, context=context)
@@ -84,7 +83,7 @@ class GraspNode(ManagedNode):
         self.start(self._settings.current.autostart)
 
     def _configure(self) -> None:
-        """Compile or load the kernels, so that no first cloud waits."""
+        """Compile or load the kernels, so that the first cloud does not wait."""
         warm_up()
 
     def _activate(self) -> None:
@@ -137,7 +136,8 @@ class GraspNode(ManagedNode):
         return 1e-9 * self.get_clock().now().nanoseconds
 
     def _age(self, cloud: PointCloud2) -> float:
-        """Seconds since the image of the last cloud; since the cloud came where its stamp is of another clock."""
+        """Return the seconds since the stamp of the last cloud, or since its arrival if the stamp is of another
+        clock."""
         now, stamp = self._now(), 1e-9 * stamp_of(cloud)
         since = max(now - self._arrival, 0.0)
         return max(now - stamp, since) if stamp and now - stamp < OLDEST else since
@@ -202,12 +202,12 @@ class GraspNode(ManagedNode):
         return found, f"{text}; {age:.1f} s old"
 
     def _plane_in(self, header: Any) -> np.ndarray | None:
-        """The last plane, where it is in the frame of that header."""
+        """Return the last plane if it is in the frame of this header."""
         plane = self._plane
         return plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
 
     def _answer(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
-        """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
+        """Plan and publish; return the grasps and why bodies have none.  No message ends the node."""
         try:
             if message.header.frame_id == CUBE_FRAME:
                 raise ValueError("views of the unit cube have no metres to grasp in")
@@ -245,12 +245,12 @@ class GraspNode(ManagedNode):
         return found
 
     def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
-        """Markers of grasps, by their bodies' ids, which replace the markers before."""
+        """Return markers of grasps with their bodies' ids, which replace the earlier ones."""
         return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replace_markers(ids))
 
 
 def plan(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
-    """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
+    """Plan grasps as the parameters say; excluded bodies are obstacles without grasps."""
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement
     plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)

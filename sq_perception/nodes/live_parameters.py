@@ -1,4 +1,4 @@
-"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, followed while the node runs.
+"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, updated at run time.
 
 Each field of such a dataclass is one parameter of the same name; :func:`setting` carries its descriptor:
 meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them
@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 
 
 class ParameterError(ValueError):
-    """A parameter that cannot be used; names it, what was expected and what arrived."""
+    """Error that names an invalid parameter, what was expected and what arrived."""
 
 
 def setting(
@@ -33,14 +33,14 @@ def setting(
     choices: tuple[str, ...] = (),
     live: bool = True,
 ) -> Any:
-    """A dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
+    """Return a dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
     about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
     return field(default=default, metadata=about)
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a node.  rclpy checks types and ranges, by the descriptors; what fits together is checked here.
+    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.
 
     Raises ParameterError for a value that is none of the choices, or does not fit the others.
     """
@@ -56,7 +56,7 @@ P = TypeVar("P", bound=Parameters)
 
 
 class LiveParameters(Generic[P]):
-    """Declares the fields of a dataclass ``kind`` as parameters of a node and follows their changes.
+    """Parameters of a node, declared from the fields of a dataclass ``kind``, with their changes.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class LiveParameters(Generic[P]):
         return given
 
     def _cast(self, given: Parameter) -> Parameter:
-        """A parameter with integers as doubles where it is one, or a list of them."""
+        """Return a parameter with integers as doubles where doubles, or a list of them, are declared."""
         kind = self._kinds.get(given.name)
         if kind is float and given.type_ == Parameter.Type.INTEGER:
             return Parameter(given.name, value=float(given.value))
@@ -112,7 +112,7 @@ class LiveParameters(Generic[P]):
         return given
 
     def _values(self, changes: list[Parameter]) -> dict[str, Any]:
-        """The values by name, without rclpy's own parameters, which another thread may declare."""
+        """Return the values by name, without rclpy's own parameters, which another thread may declare."""
         return {change.name: self._kinds[change.name](change.value) for change in changes if change.name in self._kinds}
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
@@ -137,7 +137,7 @@ class LiveParameters(Generic[P]):
 
 
 def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
-    """The descriptor of a field: its type, its text with the unit, its range or choices.
+    """Return the descriptor of a field: type, text with unit, range or choices.
 
     It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
     """

@@ -7,8 +7,8 @@
 | `mask/image` | sensor_msgs/Image | out: label images (16UC1), where recordings have them or they are asked for |
 | `~/truth` | sensor_msgs/PointCloud2 | out: the bodies of generated scenes, in the message of the recovery |
 
-All carry the same stamp and frame.  Publishers are reliable, which best effort subscribers hear too.  The image goes
-last: whoever has it has the rest.
+All have the same stamp and frame.  Publishers are reliable, so best effort subscribers receive them too.  The image is
+published last: whoever has it has the rest.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sq_perception.simulation.scenes import TABLE_CAMERA
 
 
 def frame_source(parameters: SyntheticParameters) -> FrameSource:
-    """The images that the parameters ask for.
+    """Return the images that the parameters ask for.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
 
 
 class SyntheticDepthNode(Node):
-    """Publishes a frame per tick of its timer.
+    """Node that publishes one frame per tick of its timer.
 
     Raises
     ------
@@ -86,7 +86,7 @@ class SyntheticDepthNode(Node):
         self.get_logger().info(f"publishing {self._settings.current.scene} frames on {self._image.topic_name}")
 
     def close(self) -> bool:
-        """There is nothing to wait for."""
+        """Return at once: there is nothing to wait for."""
         return True
 
     def _check(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:

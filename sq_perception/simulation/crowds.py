@@ -1,4 +1,4 @@
-"""Crowds: random superquadrics on a table that lean on each other and hide each other.
+"""Crowds: random superquadrics on a table that touch and occlude each other.
 
 Most bodies are pushed along the table against another one until they touch.  Convex bodies A and B overlap where a
 point of one's surface lies inside the other; the push ends where no sampled point does any more.
@@ -29,7 +29,7 @@ _SURFACE_SAMPLES = 1500
 
 
 def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
-    """``count`` random bodies on a table seen from 0.5 to 1.2 m, most touching another one, wholly inside the image.
+    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class _Placed:
 
 
 def _push(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
-    """The body moved along the table, straight towards the other one or away from it, until they just touch."""
+    """Push a body along the table, straight towards the other one or away from it, until they just touch."""
     way = body.body.translation - other.body.translation
     way = way - (way @ normal) * normal
     length = float(np.linalg.norm(way))

@@ -1,7 +1,7 @@
-"""Scenes of household things on a table: standing, lying, leaning on each other, stacked, close together.
+"""Scenes of household objects on a table: standing, lying, leaning on each other, stacked, close together.
 
 The table's frame has x to the right, y away from the camera, z up; its origin is the point that the camera looks at,
-from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Things rest in it:
+from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Objects rest in it:
 
     apart       somewhere on the table, at least 3 mm from all others
     beside      pushed along the table against another one until they touch, as seen from above
@@ -41,7 +41,7 @@ ELEVATION = (20.0, 70.0)
 _ROLL = float(np.deg2rad(5.0))
 _WALL = (1.8, 3.5)
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
-"""Tried; many a thing can neither lean nor be stacked where it is tried."""
+"""Tried; many an object can neither lean nor be stacked where it is tried."""
 _GAP = 0.003
 _ALONG = 1e-6
 """Component of a unit vector: what comes no nearer than this to a plane moves along it."""
@@ -60,14 +60,14 @@ _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
 
 @dataclass(frozen=True, eq=False)
 class PlacedThing:
-    """One thing of a scene.
+    """One object of a scene.
 
     Attributes
     ----------
     rest
         How it lies, and how it came there.
     rotation, translation : (4,), (3,)
-        Optical from the thing's frame.
+        Optical from the object's frame.
     label
         Its value in the label image.
     pixels
@@ -83,20 +83,20 @@ class PlacedThing:
 
     @property
     def parts(self) -> Superquadric:
-        """The thing's parts in the optical frame."""
+        """The object's parts in the optical frame."""
         return Superquadric.from_flat(move(self.thing.parts.to_flat(), self.rotation, self.translation))
 
 
 @dataclass(frozen=True, eq=False)
 class ThingsOnTable:
-    """A scene, its true image and its truth.
+    """A scene with its true image and its truth.
 
     Attributes
     ----------
     depth : float64 (height, width)
         +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
     labels : int32 (height, width)
-        True masks, 0 for what is no thing.
+        True masks, 0 for what is no object.
     plane : (4,)
         Height above the table = n.p + d.
     table : (3, 3)
@@ -116,7 +116,7 @@ class ThingsOnTable:
 
 @dataclass(frozen=True, eq=False)
 class _Resting:
-    """A thing in the table's frame, its support in ``_WAYS`` and whether something may stand on it."""
+    """An object in the table's frame, its support in ``_WAYS`` and whether others may stand on it."""
 
     thing: Thing
     rest: str
@@ -130,12 +130,12 @@ class _Resting:
         return replace(self, shift=self.shift + by, reach=self.reach + _WAYS @ by)
 
     def apart(self, other: _Resting, gap: float) -> bool:
-        """Whether a tried plane lies between both, ``gap`` wide; level ones need none."""
+        """Return whether a tried plane separates both by ``gap``; level planes need no gap."""
         free = -(self.reach + other.reach[_BACK])
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
 
     def push(self, way: np.ndarray, other: _Resting) -> _Resting | None:
-        """Moved along the level ``way``, from before the other one, until it touches; None if it passes by."""
+        """Push along the level ``way``, from before the other one, until it touches; None if it passes by."""
         gap, closing = -(other.reach + self.reach[_BACK])[:_UP], -(_WAYS[:_UP] @ way)
         comes = closing > _ALONG
         ends = (gap[comes] / closing[comes]).max()
@@ -151,14 +151,14 @@ def things_on_table(
     camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION,
 ) -> ThingsOnTable:
-    """``count`` things, or 1 to 8, on a table, all of them wholly inside the image.
+    """Place ``count`` objects, or 1 to 8, on a table, all wholly inside the image.
 
     The camera is ``elevation`` (least, greatest) degrees above the table.
 
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 8, the camera is no pinhole, or the things find no room in its image.
+        If ``count`` is not 1 to 8, the camera is no pinhole, or the objects find no room in its image.
     """
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
@@ -195,7 +195,7 @@ def _arrange(
 
 
 def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
-    """A thing placed in one of the ways of the module; None where that way is not possible."""
+    """Place an object in one of the ways of the module; None if that is not possible."""
     rest, turn = thing.pose(rng, leaning=0.0)
     bearing = rng.uniform(0, 2 * np.pi)
     way = np.array([np.cos(bearing), np.sin(bearing), 0.0])

@@ -31,7 +31,7 @@ _FARTHEST_MOVE = 4
 
 @dataclass(frozen=True)
 class Triangulation(SensorNoise):
-    """What structured light and stereo share.
+    """Common base of structured light and stereo.
 
     Attributes
     ----------
@@ -98,13 +98,13 @@ class Triangulation(SensorNoise):
             return np.where(lost, np.float32(np.nan), 1 / w).astype(np.float32)
 
     def _matched(self, scene: InverseDepth, lost: np.ndarray) -> tuple[InverseDepth, np.ndarray]:
-        """What matching makes of the scene and of the pixels that are lost so far."""
+        """Return what matching makes of the scene and of the pixels lost so far."""
         return scene, lost
 
     def _wander(
         self, scene: InverseDepth, cosine: np.ndarray, lost: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Inverse depth, cosine and lost pixels with displaced edges."""
+        """Return inverse depth, cosine and lost pixels with displaced edges."""
         if self.edge_wander == 0:
             return scene.w, cosine, lost
         brush = np.ones((2 * _FARTHEST_MOVE + 1, 2 * _FARTHEST_MOVE + 1), np.uint8)
@@ -123,7 +123,7 @@ class Triangulation(SensorNoise):
         return self.edge_wander
 
     def _thin_out(self, lost: np.ndarray, cosine: np.ndarray, rng: np.random.Generator) -> None:
-        """Lose readings of grazing surfaces, window-sized patches of them together."""
+        """Drop readings of grazing surfaces, in window-sized patches."""
         from scipy.special import ndtri  # here: a node that recovers does without
 
         v, u = np.nonzero(~lost & (cosine < np.cos(np.radians(self.grazing))))
@@ -151,7 +151,7 @@ class StructuredLight(Triangulation):
 
 @dataclass(frozen=True)
 class Stereo(Triangulation):
-    """Two imagers, with or without a projector: sigma = z^2 subpixel / (f b).
+    """Sensor of two imagers, with or without a projector: sigma = z^2 subpixel / (f b).
 
     The match of a window takes the nearer of two surfaces in it: foregrounds are fattened, by ``fattening`` pixels all
     around, over what the second imager does not see as well.  Columns that lie outside the second image are missing: a
@@ -185,7 +185,7 @@ class Stereo(Triangulation):
 
 
 def _average(rng: np.random.Generator, shape: tuple[int, ...], window: tuple[int, int]) -> np.ndarray:
-    """Normal numbers (height, width) of variance 1, averaged over a window (columns, rows)."""
+    """Average normal numbers (height, width) over a window (columns, rows), with variance 1."""
     columns, rows = window
     height, width = shape[0] + rows - 1, shape[1] + columns - 1
     white = rng.standard_normal((height, width), dtype=np.float32)
