@@ -13,7 +13,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_parts, support_surface
+from sq_perception.segmentation import convex_parts
 from sq_perception.segmentation.support_surface import SupportSurface
 
 LEAST_SIGMA = 5e-4
@@ -46,7 +46,6 @@ def above(
     clear = cv2.blur(relative, (3, 3)) > support.clear_height
     # The mean beside a tall body is that of its height: the pixel itself decides there.
     raised = relative > 0.5 * support.clear_height
-    raised &= ~support_surface.risen(relative, known, valid, camera)
     clear &= raised
     left, top, width, height = regions.box(clear)
     if width == 0:

@@ -5,7 +5,6 @@ Rows and columns of the grid are counted by its samples, k pixels apart; points 
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from sq_perception.imaging import depth_steps
@@ -35,9 +34,3 @@ def connected_parts(rows: np.ndarray, columns: np.ndarray, on: np.ndarray, shape
     mask = np.zeros(shape, bool)
     mask[rows[on], columns[on]] = True
     return np.asarray(depth_steps.components(mask)[rows, columns])
-
-
-def in_pixels(mask: np.ndarray, k: int, shape: tuple[int, ...]) -> np.ndarray:
-    """A mask of a coarse image, uint8, in the pixels of the image, bool of its shape; ``k`` pixels a sample."""
-    full = cv2.resize(mask, None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
-    return np.asarray(full[: shape[0], : shape[1]] > 0)
