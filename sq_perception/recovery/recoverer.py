@@ -312,7 +312,7 @@ class Recoverer:
             return segments.from_labels(readings.labels, depth, camera, options)
         proposed = segments.proposed(depth, camera, options.depth_range)
         if options.repair and isinstance(self._network_for(readings), inference.ThingPredictor):
-            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared)
+            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared, options.max_size)
             return segments.limited(network.improved(proposed), depth, camera, options)
         return segments.limited(segments.judged(proposed), depth, camera, options)
 

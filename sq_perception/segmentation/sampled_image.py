@@ -52,11 +52,6 @@ class Samples:
         """Median depth."""
         return quantile(self.z, 0.5)
 
-    @property
-    def width(self) -> float:
-        """The larger side of the box around the segment across the line of sight, metres."""
-        return float(np.ptp(self.points[:, :2], axis=0).max())
-
 
 @dataclass(frozen=True, eq=False)
 class SampledImage:

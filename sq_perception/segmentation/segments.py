@@ -83,8 +83,6 @@ class Segmentation:
         The probability, by ``ids``, that each is a thing; 1 for labels given from outside.
     larger, outside
         How many objects were left out as they are larger than ``max_size``, or outside of the workspace.
-    claims : tuple of pairs
-        Labels a, b: a network says that most of b is of the object that a shows.
     heights : HeightEvidence or None
         What the segments are judged by, until they are.
     """
@@ -98,7 +96,6 @@ class Segmentation:
     objectness: tuple[float, ...] = ()
     larger: int = 0
     outside: int = 0
-    claims: tuple[tuple[int, int], ...] = ()
     heights: HeightEvidence | None = None
 
 
@@ -176,15 +173,11 @@ def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
         labels=regions.renumbered(found.labels, number),
         ids=tuple(range(1, len(order) + 1)),
         objectness=tuple(likely[label] for label in order),
-        claims=tuple((int(number[a]), int(number[b])) for a, b in found.claims if number[a] and number[b]),
     )
 
 
 def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> Segmentation:
-    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``.
-
-    What claims to be a piece of one that is too large is left out as well.
-    """
+    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
     depth, valid = _checked(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
     larger, outside = set(), set()
@@ -194,8 +187,7 @@ def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: Seg
             larger.add(label)
         elif not options.is_within(points):
             outside.add(label)
-    of_larger = {one for one, other in found.claims if other in larger}
-    left = [label for label in found.ids if label not in larger | outside | of_larger]
+    left = [label for label in found.ids if label not in larger | outside]
     ids = left[: options.max_objects]
     likely = dict(zip(found.ids, found.objectness or (1.0,) * len(found.ids), strict=True))
     is_cut = found.is_cut or len(left) > len(ids)

@@ -23,7 +23,6 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import deviation, quantile
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import coarse_grid
 from sq_perception.segmentation.support_plane import (
     LEAST_GROWTH,
     TOLERANCE,
@@ -31,14 +30,14 @@ from sq_perception.segmentation.support_plane import (
     noise_growth,
 )
 
+_SAMPLES = 120
+"""Samples along the shorter side of the image that the surface is fitted to."""
 _ROUNDS = 6
 """Rounds of reweighting, at most: it ends when it is settled."""
 _TERMS = 6
 """Coefficients of a quadratic surface."""
 _DISTORTION = 0.02
 """Makers of depth cameras promise an error of at most 2 % of the depth."""
-_GAIN = 1.05
-"""A support is bent if that brings so many times the samples within half of the tolerance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +89,9 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    points = coarse_grid.samples(depth, valid, camera)[3]
+    k = max(1, min(depth.shape) // _SAMPLES)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
     z = points[:, 2]
     x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
     height = plane.height(points) / growth
@@ -109,9 +110,6 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
         if is_settled:
             break
     within = np.abs(off)
-    gained = np.count_nonzero(within < 0.5 * TOLERANCE)
-    if gained < _GAIN * np.count_nonzero(np.abs(height) < 0.5 * TOLERANCE):
-        return flat
     return SupportSurface(plane, bend, limit, deviation(within[within < TOLERANCE]))
 
 

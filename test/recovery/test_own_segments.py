@@ -145,25 +145,6 @@ def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
     assert abs(len(first) - len(second)) < 0.2 * len(first)
 
 
-@pytest.mark.parametrize(("before", "parts"), [(0.1, 1), (-0.1, 2)])
-def test_the_ends_of_a_box_behind_a_post_stay_one_whatever_the_network_says(before: float, parts: int) -> None:
-    """It doubts the box, and takes its halves for two things; so they are where what is between them is farther."""
-    depth, truth = seen([TABLE.body(0, 0, (0.1, 0.03, 0.05), (0.1, 0.1))])
-    post = np.abs(np.arange(CAMERA.width) - np.median(np.nonzero(truth)[1])) < 10
-    labels = np.where(post, 2, 1) * truth
-    depth = np.where(labels == 2, depth - before, depth).astype(np.float32)
-
-    def doubts_the_box(views: np.ndarray) -> np.ndarray:
-        if network.asked > 2:  # pieces of the box
-            return claims_of_halves(views)
-        return np.where(views[..., segment_view.SEGMENT] > 0, np.array([1.2, 3.0])[:, None, None], -3.0)
-
-    network = GivenLogits(doubts_the_box)
-    found = of(network, depth).improved(segmentation(labels))
-    assert len(np.unique(found.labels[labels == 1])) == parts
-    assert len(found.ids) == parts + 1
-
-
 def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     """The network sees an object in the right half, and none in the left one, as where a sensor smeared an edge."""
 
@@ -196,6 +177,15 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
     assert found.ids == (1,)
     assert not found.strays.any()
     assert network.asked == 4 + 2 + 1
+
+
+@pytest.mark.parametrize(("max_size", "objects"), [(0.6, 1), (0.25, 1), (0.12, 2)])
+def test_what_would_be_larger_than_an_object_is_not_joined(max_size: float, objects: int) -> None:
+    """Two cans, 0.19 m across together, of which each is taken for a part of the other."""
+    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0, *CAN)])
+    network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
+    found = replace(of(network, depth), max_size=max_size).improved(segmentation(truth))
+    assert len(found.ids) == objects
 
 
 def test_one_sided_belonging_joins_nothing() -> None:
@@ -272,52 +262,6 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     depth, truth = table.see(bodies, 0.002, camera=camera)
     found = of(shipped, depth, camera, table.plane).improved(segmentation(truth))
     assert len(found.ids) == 5
-
-
-def halves_alone(pixels: int, of_all: str, of_half: str = "itself") -> GivenLogits:
-    """A network that is shown a segment of so many pixels, halves and smaller pieces of it.
-
-    Of all it takes the left part, 60 %, for the object, or ``of_all`` is "nothing"; of the rest, or of a half, that
-    itself or "everything"; of a smaller piece nothing.
-    """
-
-    def logits(views: np.ndarray) -> np.ndarray:
-        answers = []
-        for mine, cell in zip(views[..., segment_view.SEGMENT] > 0, np.exp(views[:, 0, 0, GRAIN]), strict=True):
-            share = np.count_nonzero(mine) * cell**2 / pixels
-            left = np.arange(mine.shape[1]) < np.quantile(np.nonzero(mine)[1], 0.6)
-            if share > 0.75:
-                answers.append(mine & left & (of_all == "left"))
-            else:
-                answers.append((mine | (of_half == "everything")) & (share > 0.33))
-        return np.where(answers, 3.0, -3.0)
-
-    return GivenLogits(logits)
-
-
-def test_what_is_left_of_a_segment_may_be_an_object_of_its_own() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(halves_alone((truth > 0).sum(), "left"), depth).improved(segmentation(truth))
-    assert found.ids == (1, 2)
-    np.testing.assert_array_equal(found.labels > 0, truth > 0)
-    columns = [np.nonzero((found.labels == label) & ~found.strays)[1] for label in found.ids]
-    first, second = sorted(columns, key=lambda each: float(each.mean()))
-    assert first.max() < second.min()
-    assert np.count_nonzero(found.strays) < 0.1 * np.count_nonzero(truth)
-
-
-def test_what_is_left_of_a_segment_and_claims_it_stays_stray() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(halves_alone((truth > 0).sum(), "left", "everything"), depth).improved(segmentation(truth))
-    assert found.ids == (1,)
-    assert np.count_nonzero(found.strays) > 0.3 * np.count_nonzero(truth)
-
-
-def test_of_a_dropped_segment_that_is_not_connected_each_piece_is_asked_about() -> None:
-    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
-    found = of(halves_alone((truth > 0).sum(), "nothing"), depth).improved(segmentation((truth > 0).astype(np.int32)))
-    assert len(found.ids) == 2
-    assert min(ious(truth, found.labels)) > 0.95
 
 
 def test_no_segments_ask_nothing() -> None:
