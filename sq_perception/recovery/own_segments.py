@@ -1,4 +1,4 @@
-"""Segments of a depth image as a network sees them: which of them are one object, and which of their pixels are strays.
+"""Segments of a depth image as a network sees them: which of them are one object, and which pixels are outliers.
 
 Rules of geometry take an image apart (:mod:`sq_perception.segmentation.segments`); a network that saw thousands of such
 segments knows better what belongs together.  For a segment a it predicts p_a(x), the probability that the reading of a
@@ -10,9 +10,9 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
               found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the object
               that claims it most
     joined    a and b are one if each is the other's object: if the smaller of the means of p_a over b and of p_b over a
-              is more than ``_ONE``; the surest pairs first, until there is none.  Not where both together are larger than
-              ``max_size``, but no larger than the largest thing: in a heap of small things they are two of them
-    strays    pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
+              is more than ``_ONE``; the surest pairs first, until there is none.  Not where both together are larger
+              than ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
+    outliers  pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
               label image, as they are no background either, but no fit takes them for the object's surface
     nothing   a is dropped if it is no thing (:mod:`sq_perception.segmentation.objectness`), by the median logit of p_a
               over it and by its rise: a bump of the table, a wall, the room behind; not where there is no support
@@ -110,7 +110,7 @@ class SegmentNetwork:
     max_size: float = LARGEST_THING
 
     def improved(self, found: Segmentation) -> Segmentation:
-        """Segments parted, joined, with their strays, without those of nothing; labels from 1, the largest first."""
+        """Segments parted, joined, with their outliers, without those of nothing; labels from 1, the largest first."""
         if not found.ids:
             return found
         labels = found.labels.copy()
@@ -121,11 +121,11 @@ class SegmentNetwork:
         while len(seen) > 1 and (joined := self._joined(labels, seen)):
             seen |= self._seen(labels, joined)
         likely = self._things(labels, seen, found.heights)
-        strays = np.zeros(labels.shape, bool)
+        outliers = np.zeros(labels.shape, bool)
         for label in likely:
             window = seen[label].window
-            strays[window] |= _strays(labels[window] == label, _logits(seen[label]))
-        found = replace(found, labels=labels, strays=strays)
+            outliers[window] |= _outliers(labels[window] == label, _logits(seen[label]))
+        found = replace(found, labels=labels, outliers=outliers)
         return segments.kept(found, likely)
 
     def _things(
@@ -171,7 +171,8 @@ class SegmentNetwork:
     def _may_be_one(self, mask: np.ndarray) -> bool:
         """Whether what a mask (height, width) shows may be one object, or one piece of furniture, which is left out
         whole: no object is between ``max_size`` and the largest thing."""
-        points = regions.some_points(*np.nonzero(mask), self.depth, self.camera, _POINTS)
+        rows, columns = np.nonzero(mask)
+        points = regions.some_points(rows, columns, self.depth, self.camera, _POINTS)
         edge = largest_edge(points, None if self.plane is None else self.plane[:3])
         return edge <= self.max_size or edge > LARGEST_THING
 
@@ -287,7 +288,7 @@ def _logits(answer: _Seen) -> np.ndarray:
     return answer.view.at_pixels(answer.logits, answer.window)
 
 
-def _strays(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
+def _outliers(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
     """The pixels of a segment that are not its object's own.
 
     None where they are most of it, as the object is what most of the segment shows, or nearly all.

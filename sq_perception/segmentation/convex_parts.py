@@ -32,7 +32,7 @@ import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_pieces, crossings
+from sq_perception.segmentation import convex_pieces, line_of_sight
 from sq_perception.segmentation.convex_pieces import AS_ONE
 from sq_perception.segmentation.sampled_image import FEW, SampledImage, Samples, least_area
 
@@ -122,7 +122,7 @@ def _insides(image: SampledImage, rims: np.ndarray, parts: list[Samples], origin
 
 def _is_hollow(image: SampledImage, part: Samples) -> bool:
     """Whether the surface lies behind its own lines, as that of a vessel does."""
-    gap = crossings.gaps(part.pixels, part.points, image.depth, image.labels).mean()
+    gap = line_of_sight.gaps(part.pixels, part.points, image.depth, image.labels).mean()
     return bool(gap > convex_pieces.HOLLOW * image.sigma * part.distance**2)
 
 
@@ -170,7 +170,7 @@ def _crossed_between(
     borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)
     beside, behind = (each[np.ix_(names, names)] for each in borders[1:])
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
-    crossed = crossings.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
+    crossed = line_of_sight.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
     extents = regions.extents(image.labels)
     is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
@@ -190,7 +190,7 @@ def _go_on(
 
     ``names`` are the labels (n,) of the segments, ``together`` their samples as by :func:`_together`.
     """
-    along, over = crossings.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
+    along, over = line_of_sight.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
     return np.asarray(wanted & (along > _ALONG) & (over < AS_ONE))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import regions
-from sq_perception.segmentation import crossings
+from sq_perception.segmentation import line_of_sight
 from sq_perception.segmentation.sampled_image import LEAST_SAMPLES, MANY, SampledImage, Samples, least_area, stride
 
 HOLLOW = 0.5
@@ -50,13 +50,13 @@ def pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tuple
     least = _LEAST_SHARE * least_area(part.distance)
     if image.area(part, extent) < 2 * least:
         return []
-    crossed, _ = crossings.within(part.pixels, part.points, image.depth, *image.limits)
+    crossed, _ = line_of_sight.within(part.pixels, part.points, image.depth, *image.limits)
     if crossed.mean() < _SUSPICIOUS:
         return []
     whole = image.sampled(part.label, extent, MANY)
     if whole is None:
         return []
-    crossed, far = crossings.within(whole.pixels, whole.points, image.depth, *image.limits)
+    crossed, far = line_of_sight.within(whole.pixels, whole.points, image.depth, *image.limits)
     n = len(whole.z)
     group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), _APART)
     size = np.bincount(group)
@@ -66,14 +66,14 @@ def pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tuple
     # What is too small for a piece joins the one that it is nearest to.
     keep = np.flatnonzero(large[group])
     group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
-    gap = crossings.gaps(whole.pixels, whole.points, image.depth, image.labels)
+    gap = line_of_sight.gaps(whole.pixels, whole.points, image.depth, image.labels)
     group = _with_whole_vessels(group, gap, far, HOLLOW * image.sigma * whole.distance**2)
     count = int(group.max()) + 1
     if count < 2:
         return []
     rows, columns = regions.pixels(image.labels, part.label, extent)
     seen = image.depth, image.focal, whole.spacing, max(1, stride(len(rows), MANY) // _BLOCKS), *image.limits
-    chosen = crossings.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
+    chosen = line_of_sight.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
     return [(rows[chosen == k], columns[chosen == k]) for k in range(count) if (chosen == k).any()]
 
 

@@ -69,7 +69,7 @@ class SampledImage:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """``noise`` and ``least`` by which a line is crossed (:mod:`sq_perception.segmentation.crossings`)."""
+        """``noise`` and ``least`` by which a line is crossed (:mod:`sq_perception.segmentation.line_of_sight`)."""
         return _NOISE_MARGIN * self.sigma, _LEAST_GAP
 
     def sampled(self, label: int, extent: np.ndarray, count: int) -> Samples | None:

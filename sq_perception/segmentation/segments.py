@@ -8,7 +8,7 @@ Steps
    where none between them does (:mod:`sq_perception.segmentation.bodies`).
 3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
    than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
-4. Walls of a bin or a tray around things go (:mod:`sq_perception.segmentation.enclosures`).
+4. Walls of a bin or a tray around things go (:mod:`sq_perception.segmentation.container_walls`).
 5. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
    its surroundings sharpens (:mod:`sq_perception.recovery.own_segments`).
 6. Limits of size and place, and of number, are asked of what then remains.
@@ -33,8 +33,8 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     bodies,
+    container_walls,
     convex_parts,
-    enclosures,
     level_faces,
     objectness,
     pieces,
@@ -77,7 +77,7 @@ class Segmentation:
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
     is_cut
         Whether there were more objects than ``max_objects``.
-    strays : bool (height, width) or None
+    outliers : bool (height, width) or None
         Pixels of objects that did not measure them; None: not a single one that is known.
     objectness : tuple of float
         The probability, by ``ids``, that each is a thing; 1 for labels given from outside.
@@ -92,7 +92,7 @@ class Segmentation:
     ids: tuple[int, ...]
     sigma: float = _UNKNOWN_SIGMA
     is_cut: bool = False
-    strays: np.ndarray | None = None
+    outliers: np.ndarray | None = None
     objectness: tuple[float, ...] = ()
     larger: int = 0
     outside: int = 0
@@ -145,7 +145,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     tops = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(tops, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, camera, least)
-    around = enclosures.walls(tops, plane.equation)
+    around = container_walls.walls(tops, plane.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
     found = _ordered(Segmentation(labels, plane.equation, (), sigma), least)
     if is_silhouette and not found.ids:
