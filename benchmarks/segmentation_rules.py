@@ -15,8 +15,9 @@ once a rule, by the geometry and the network of masks as ``Recoverer.recover`` d
 
 A row gives what the rule gains: the figure with it less the figure without it, in per cent of the things, or segments
 in 100 scenes; with the standard error of the sum of the scenes' differences.  A rule that gains less than two standard
-errors has no place in the package.  results/segmentation_rules_before.md has those that were there before.  ``--each`` names a file of JSON lines, one a scene, that a run adds to: a run that
-was stopped goes on, and one of more scenes or other seeds counts them together.
+errors has no place in the package.  results/segmentation_rules_before.md has those that were there before.  ``--each``
+names a file of JSON lines, one a scene, that a run adds to: a run that was stopped goes on, and one of more scenes or
+other seeds counts them together.
 """
 
 from __future__ import annotations
