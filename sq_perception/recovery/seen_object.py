@@ -133,7 +133,7 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
         window = slice(top, top + height), slice(left, left + width)
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(mask[window]))
-        unread = np.flatnonzero(named ^ mask)
+        unread = np.flatnonzero(named ^ mask) if np.count_nonzero(named) > pixels else np.zeros(0, np.int64)
         masked, fills = pixels + len(unread), regions.fills((left, top, width, height), measured)
         seen.append(SeenObject(label, pixels, masked, unread, mask, depth[window], camera_crop, window, fills=fills))
     return seen

@@ -132,7 +132,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     is_silhouette = _is_silhouette(valid)
-    if is_silhouette and largest_edge(_some_points(valid, known, camera)) <= LARGEST_THING:
+    if is_silhouette and _size(valid, known, camera) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera)
@@ -164,7 +164,7 @@ def judged(found: Segmentation) -> Segmentation:
 
 def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
     """The segments of some labels, with the probability that each is a thing; renumbered from 1, the largest first."""
-    counts = np.bincount(found.labels.ravel(), minlength=max(likely, default=0) + 1)
+    counts = regions.extents(found.labels)[:, 0]
     order = sorted(likely, key=lambda label: (-counts[label], label))
     number = np.zeros(len(counts), np.int32)
     number[order] = np.arange(len(order)) + 1
@@ -181,8 +181,11 @@ def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: Seg
     depth, valid = _checked(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
     larger, outside = set(), set()
+    extents = regions.extents(found.labels)
     for label in found.ids:
-        points = _some_points((found.labels == label) & valid, depth, camera)
+        rows, columns = regions.pixels(found.labels, label, extents[label])
+        seen = valid[rows, columns]
+        points = regions.some_points(rows[seen], columns[seen], depth, camera, _POINTS)
         if camera.is_pinhole and not options.is_small(points, up):
             larger.add(label)
         elif not options.is_within(points):
@@ -287,9 +290,9 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
-def _some_points(wanted: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    rows, columns = np.nonzero(wanted)
-    return regions.some_points(rows, columns, depth, camera, _POINTS)
+def _size(valid: np.ndarray, depth: np.ndarray, camera: Camera) -> float:
+    rows, columns = np.nonzero(valid)
+    return largest_edge(regions.some_points(rows, columns, depth, camera, _POINTS))
 
 
 def _is_silhouette(valid: np.ndarray) -> bool:
@@ -323,7 +326,7 @@ def _unloaded(
 
 def _ordered(found: Segmentation, least: int) -> Segmentation:
     """The largest segments of at least so many pixels."""
-    counts = np.bincount(found.labels.ravel())
-    order = np.argsort(-counts[1:], kind="stable") + 1
+    counts = regions.extents(found.labels)[:, 0]
+    order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
     return kept(replace(found, is_cut=len(order) > _MOST), dict.fromkeys(order[:_MOST].tolist(), 1.0))
