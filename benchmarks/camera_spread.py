@@ -30,7 +30,7 @@ import numpy as np
 from common import report
 
 from sq_perception.simulation.camera_stages import draw_stages
-from sq_perception.simulation.thing_sensing import measured_by_any
+from sq_perception.simulation.thing_sensing import measure_by_any
 from sq_perception.simulation.things_on_table import things_on_table
 
 FIGURES = ("gaps beside", "gaps on", "smear", "lost edge", "correlation 1", "correlation 4")
@@ -91,7 +91,7 @@ def simulated(seeds: range) -> Iterator[np.ndarray]:
     for seed in seeds:
         rng = np.random.default_rng(seed)
         scene = things_on_table(rng)
-        depth = measured_by_any(scene.depth, scene.labels > 0, scene.camera, draw_stages(rng), rng)
+        depth = measure_by_any(scene.depth, scene.labels > 0, scene.camera, draw_stages(rng), rng)
         yield figures(depth, scene.labels)
 
 

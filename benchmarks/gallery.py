@@ -70,9 +70,9 @@ def measured(found: Sequence[MatchedThing], frame: FrameRecovery) -> str:
     ]
     missed = ", ".join(name for name, body in bodies.items() if body is None)
     return (
-        f"{len(errors)} of {len(found)} things found{f' (missed: {missed})' * bool(missed)}, "
-        f"{len(frame.recovered) - len(errors)} bodies too many. Mean IoU "
-        f"{100 * np.mean([one.iou for one in found]):.0f} %, edges off by {np.mean(errors):+.1f} mm in the mean."
+        f"{len(errors)} of {len(found)} objects found{f' (missed: {missed})' * bool(missed)}, "
+        f"{len(frame.recovered) - len(errors)} false positives. Mean IoU "
+        f"{100 * np.mean([one.iou for one in found]):.0f} %, mean edge error {np.mean(errors):+.1f} mm."
     )
 
 
@@ -84,9 +84,7 @@ def edges(one: MatchedThing) -> str:
     order = np.argsort(-one.body.superquadric.size)
     seen, sigma = 100 * one.body.seen[order], 2e3 * one.body.sigma_size[order]
     sizes, true = 2e3 * one.body.superquadric.size[order], 1e3 * one.placed.thing.edges[::-1]
-    parts = [
-        f"edge {seen[k]:.0f} % measured, {sizes[k]:.0f} ± {sigma[k]:.0f} mm, truly {true[k]:.0f}" for k in range(3)
-    ]
+    parts = [f"edge {seen[k]:.0f} % visible, {sizes[k]:.0f} ± {sigma[k]:.0f} mm, true {true[k]:.0f}" for k in range(3)]
     return (
         f"{name}: {'; '.join(parts)} (`seen`, `sigma_size`). Status `{Status(one.body.status).name}`, message: "
         f"{one.body.message}."
@@ -97,31 +95,31 @@ ENTRIES = {
     "can": Entry(
         "One can",
         (Stood("can", can(75, 110), (0.0, 0.0)),),
-        "Its back comes from the silhouette and the curvature of the front, its foot from the table.",
+        "The silhouette and the curvature of the front determine its back, the table its foot.",
         distance=0.6,
     ),
     "household_stereo": Entry(
-        "A table by stereo",
+        "Stereo",
         kitchen(),
-        "Six things that stand before each other. Stereo widens what is near by some pixels.",
+        "Six objects that occlude each other. Stereo widens near objects by some pixels.",
         distance=0.85,
     ),
     "household_structured_light": Entry(
-        "The same table by structured light",
+        "Structured light",
         kitchen(),
-        "Less noise than stereo has.",
+        "The same table with less noise.",
         sensor="kinect_v1",
         distance=0.85,
     ),
     "touching": Entry(
-        "Things that touch",
+        "Touching objects",
         (
             Stood("high box", carton(80, 60, 130), (-0.07, 0.03)),
             Stood("low box", carton(100, 80, 60), (0.0201, 0.02)),
             Stood("flat box", carton(90, 60, 35), (-0.045, -0.0562), 8),
             Stood("can", can(66, 100), (0.1035, 0.02)),
         ),
-        "Three boxes and a can, parted at folds in the depth and by lines of sight between them.",
+        "Three boxes and a can, separated at depth folds and by lines of sight between them.",
         distance=0.65,
     ),
     "bottles": Entry(
@@ -131,7 +129,7 @@ ENTRIES = {
             Stood("bottle 2", bottle(4), (0.0, 0.08)),
             Stood("bottle 3", bottle(9), (0.1, -0.06), 35, mesh_things.ON_X),
         ),
-        "No superquadric has a shoulder and a neck: one body leaves out the neck, or bottle and neck become two.",
+        "No superquadric has a shoulder and a neck: a body omits the neck, or the bottle becomes two bodies.",
         down=32.0,
     ),
     "half_hidden": Entry(
@@ -149,12 +147,12 @@ ENTRIES = {
 }
 
 INTRODUCTION = """
-Synthetic scenes through simulated [sensors](sensors.md), own masks and default options, one run of `python
-benchmarks/gallery.py` ({facts}); [figures over many scenes](../README.md#accuracy-and-speed).
+Simulated [sensors](sensors.md), own masks, default options; one run of `python benchmarks/gallery.py` ({facts}).
+[Figures over many scenes](../README.md#accuracy-and-speed).
 
-Left the depth image, near is light, black is not measured; in the middle masks and recovered outlines, hidden edges
-faint; right the recovered bodies, with the true things as thin lines. Edges are full lengths, ± one reported standard
-deviation; IoU is with the true convex hull.
+Left: depth image, near is light, black has no reading. Middle: masks and recovered outlines, hidden edges faint.
+Right: recovered bodies, true objects as thin lines. Edges are full lengths ± one sigma; IoU is with the true convex
+hull.
 """
 
 

@@ -38,7 +38,7 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewSource, draw_views
 from sq_perception.learning.forward import CompactRegressor
-from sq_perception.learning.network_config import checked_views
+from sq_perception.learning.network_config import check_views
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.simulation.scenes import thesis_bodies
@@ -82,7 +82,7 @@ def predict_by_onnxruntime(model: Regressor) -> Callable[[np.ndarray], Any]:
     name = session.get_inputs()[0].name
 
     def predict(views: np.ndarray) -> Any:
-        (raw,) = session.run(None, {name: checked_views(views, model.config)[:, None]})
+        (raw,) = session.run(None, {name: check_views(views, model.config)[:, None]})
         return model.config.decode(raw.astype(float))
 
     return predict

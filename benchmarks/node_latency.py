@@ -60,7 +60,7 @@ OFFERED = {"five objects, 3 times the rate": ("table 640 x 480, five objects", 3
 
 def record(folder: Path) -> None:
     """Write what a simulated D435 measures of five objects on a table, ``HOLD`` frames of each of ``SCENES`` scenes."""
-    made = frame_source.generated("table", 0, objects=5)
+    made = frame_source.generate("table", 0, objects=5)
     source = frame_source.FrameSource(made, SCENES, seed=0, hold=HOLD, loop=False)
     number = 0
     while (frame := source.next(0.0, "realsense_d435")) is not None:

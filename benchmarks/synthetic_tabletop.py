@@ -33,7 +33,7 @@ from sq_perception.geometry import Superquadric, metrics
 from sq_perception.imaging import raycast
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.crowds import crowded_scene
+from sq_perception.simulation.crowds import draw_crowd
 from sq_perception.simulation.scenes import Scene
 
 SEED = 7500
@@ -84,7 +84,7 @@ class FrameScore:
 def frame(number: int, sensor: str) -> SensedScene:
     """Scene ``number`` through a sensor."""
     rng = np.random.default_rng([SEED, number])
-    return sensed(crowded_scene(rng, int(rng.integers(BODIES[0], BODIES[1] + 1))), sensor, rng)
+    return sensed(draw_crowd(rng, int(rng.integers(BODIES[0], BODIES[1] + 1))), sensor, rng)
 
 
 def sensed(scene: Scene, sensor: str, rng: np.random.Generator) -> SensedScene:

@@ -32,7 +32,7 @@ from common import report, scene_verdict, tabletop
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.union import moved
+from sq_perception.geometry.union import move
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_table
@@ -61,7 +61,7 @@ def from_aside(truth: ThingsOnTable, degrees: float) -> tuple[ThingsOnTable, tup
     owner = np.repeat(range(len(placed)), [len(one.thing.parts) for one in placed])
     whose = np.repeat(range(len(placed)), [len(one.thing.cavities) for one in placed])
     parts = np.vstack([one.parts.to_flat() for one in placed])
-    holes = np.vstack([moved(one.thing.cavities.to_flat(), one.rotation, one.translation) for one in placed])
+    holes = np.vstack([move(one.thing.cavities.to_flat(), one.rotation, one.translation) for one in placed])
     bodies, cavities = Superquadric.from_flat(parts), Superquadric.from_flat(holes)
     depth, index = render_things(bodies, owner, cavities, whose, truth.camera, plane, truth.wall)
     shown = tuple(replace(one, pixels=int((index == k).sum())) for k, one in enumerate(placed))

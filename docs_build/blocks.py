@@ -1,4 +1,4 @@
-"""The parts of the documents that can be measured or read from the source; nobody writes them by hand.
+"""Make the parts of the documents that are measured or read from the source; never edit them by hand.
 
     python docs_build/blocks.py     rewrites them in README.md and docs/
 
@@ -40,7 +40,7 @@ def table(head: str, rows: Iterable[str]) -> str:
 # Figures
 
 HULL, EDGES, SIGMAS = "IoU with the true convex hull %", "error of full edges mm", "within 2 sigma %"
-BOTH_IOU = "IoU %, masks given / own"
+BOTH_IOU = "IoU %, given / own masks"
 
 
 def results(name: str) -> Any:
@@ -51,12 +51,12 @@ def accuracy() -> str:
     """Images of the thesis' protocol: IoU from the evaluation, times of whole recoveries from the occlusion bench."""
     summaries = {one["name"]: one["summary"] for one in results("evaluation")["contestants"]}
     timed = results("occlusion")["rows"]["thesis, 0 % hidden"]
-    supervised = "94.62 +- 3.18, 99.06 over 85, 2.88 ms on a GPU"
+    supervised = "94.62 +- 3.18, 2.88 ms on a GPU"
     shown = [
-        ("`auto`: network + surface fit", "auto", "auto", ""),
-        ("`symmetry`: surface fit without the network", "symmetry", "symmetry", ""),
-        ("`network` alone, weights `supervised`", "supervised", "network supervised", supervised),
-        ("`network` alone, weights `robust` (default)", "robust", "network robust", ""),
+        ("`auto`: network and fit", "auto", "auto", ""),
+        ("`symmetry`: fit only", "symmetry", "symmetry", ""),
+        ("`network`, `supervised`", "supervised", "network supervised", supervised),
+        ("`network`, `robust` (default)", "robust", "network robust", ""),
         ("`classic`: Solina and Bajcsy", "classic", "classic", "84.51 +- 8.89, 690 ms"),
     ]
     rows = []
@@ -66,17 +66,17 @@ def accuracy() -> str:
         time = timed[clock]["milliseconds"]["median"]
         iou = f"{mean:.2f} +- {std:.2f} | {least:.1f} | {over:.1f}"
         rows.append(f"{title} | {of['bodies']} | {iou} | {time:.1f} | {thesis}")
-    return table("method | bodies | IoU mean +- std | min | > 85 % | ms | the thesis reports", rows)
+    return table("method | bodies | IoU mean +- std | min | > 85 % | ms | thesis", rows)
 
 
 def household() -> str:
     """Household things on a table through simulated sensors, at least half visible."""
     found = results("real_scenes")
     names = {
-        "given": "`auto`, masks given",
+        "given": "`auto`, given masks",
         "own": "`auto`, own masks",
-        "classic": "`classic`, masks given",
-        "oriented box": "smallest box of the seen points, masks given",
+        "classic": "`classic`, given masks",
+        "oriented box": "smallest box of the visible points, given masks",
     }
     rows = []
     for name, text in names.items():
@@ -97,13 +97,13 @@ def kinds() -> str:
     }
     shown = [(title, scenes[f"{name}: given"], scenes[f"{name}: own"]) for title, name in names.items()]
     every = "all, at least half visible"
-    shown.append(("harder things", harder[f"{every}: given"], harder[f"{every}: own"]))
+    shown.append(("harder objects", harder[f"{every}: given"], harder[f"{every}: own"]))
     rows = []
     for title, given, own in shown:
         iou = f"{given['iou']['mean']:.1f} / {own['iou']['mean']:.1f}"
         error = f"{given['edge_error']['median']:.1f} / {own['edge_error']['median']:.1f}"
         rows.append(f"{title} | {given['iou']['count']:.0f} | {iou} | {error} | {given['within_2_sigma']:.0f}")
-    return table(f"things | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}, masks given", rows)
+    return table(f"objects | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}, given masks", rows)
 
 
 def prediction() -> str:
@@ -120,18 +120,6 @@ def prediction() -> str:
     )
 
 
-def camera_spread() -> str:
-    """Figures of recorded images beside those of simulated cameras."""
-    sources = {"mosd": "Kinect v1, 45 frames", "felix": "RealSense, 4", "pcl": "Kinect and stereo, 4"}
-    rows = []
-    for name, found in results("camera_spread").items():
-        if isinstance(found, dict) and "within" in found:
-            spread = " / ".join(f"{value:.2f}" for value in found["simulated"])
-            medians = " | ".join(f"{found[source]:.2f}" for source in sources)
-            rows.append(f"{name} | {spread} | {medians} | {100 * found['within']:.0f}")
-    return table(f"figure | simulated, 5 / 50 / 95 % | {' | '.join(sources.values())} | frames within, %", rows)
-
-
 def frame_time() -> str:
     """Whole frames of a simulated RealSense, VGA, own masks."""
     found = results("frame_time")["rows"]
@@ -142,7 +130,7 @@ def frame_time() -> str:
         parts = ", ".join(f"{row['stages'][stage]['median']:.0f}" for stage in ("segmentation", "network", "fit"))
         grasps = row["surroundings"]["median"] + row["plan"]["median"]
         rows.append(f"{count} | {total['median']:.0f} / {total['p95']:.0f} | {parts} | {grasps:.0f}")
-    return table("bodies | ms median / p95 | of which segmentation, network, fit | grasps after it, ms", rows)
+    return table("bodies | ms median / p95 | segmentation, network, fit | grasp planning, ms", rows)
 
 
 def latency() -> str:
@@ -151,7 +139,7 @@ def latency() -> str:
         "thesis 256 x 256": "256 x 256 orthographic, one body, ideal sensor",
         "table 640 x 480, one object": "640 x 480, table-top, one body, ideal sensor",
         "table 640 x 480, five objects": "640 x 480, table-top, five bodies, simulated D435",
-        "five objects, 3 times the rate": "the same, 90 Hz offered",
+        "five objects, 3 times the rate": "the same at 90 Hz",
     }
     rows = []
     for name, text in names.items():
@@ -159,28 +147,6 @@ def latency() -> str:
         times = " / ".join(f"{case['milliseconds'][part]:.1f}" for part in ("median", "p95", "max"))
         rows.append(f"{text} | {times} | {case['results_per_second']:.1f} | {case['trend_ms']:+.1f} ms")
     return table("frame | ms median / p95 / max | results / s | trend", rows)
-
-
-def still() -> str:
-    """What a frame of things that stand still costs after another one."""
-    rows = []
-    for count, row in results("still_scenes")["rows"].items():
-        after = f"{row['following']['median']:.1f} / {row['following']['mean']:.1f}"
-        iou = " | ".join(f"{100 * row['iou'][name]['mean']:.1f}" for name in ("alone", "following"))
-        rows.append(f"{count} | {row['alone']['median']:.0f} | {after} | {100 * row['repeated']:.0f} | {iou}")
-    heads = "things | processor ms alone | after another, median / mean | taken from it % | IoU % alone | after another"
-    return table(heads, rows)
-
-
-def tracks() -> str:
-    """Errors of sizes of tracked bodies by frame, per cent."""
-    frames = ("1", "10", "30", "300")
-    rows = []
-    for name, row in results("tracking")["rows"].items():
-        errors = " | ".join(f"{100 * row['error'][frame]:.2f}" for frame in frames)
-        rows.append(f"{name} | {errors} | {100 * row['bias']:.2f} | {100 * row['within_2_sigma']:.0f}")
-    after = " | ".join(f"after {frame}" for frame in frames)
-    return table(f"camera, masks | {after} | common to all views | {SIGMAS}", rows)
 
 
 def cameras() -> str:
@@ -205,40 +171,21 @@ def package_layers() -> tuple[tuple[str, ...], ...]:
     raise LookupError("test/package/test_imports.py has no LAYERS")
 
 
-def layers() -> str:
-    """A drawing of the layers, the highest first; modules import from their own layer and from those below."""
-    rows = ["   ".join(layer) for layer in reversed(package_layers())]
-    inner = max(map(len, rows))
-    line = f"+{'-' * (inner + 2)}+"
-    return "\n".join(["```text", line, *(f"| {row.center(inner)} |\n{line}" for row in rows), "```"])
-
-
 def packages() -> str:
-    """What each subpackage holds, by its docstring."""
-    names = [name for layer in reversed(package_layers()) for name in layer]
-    rows = (f"[`{name}/`](../sq_perception/{name}/__init__.py) | {purpose(name)}" for name in names)
-    return table("package | holds", rows)
+    """The subpackages with their layer and, from their docstring, their purpose; the highest layer first."""
+    layers = package_layers()
+    rows = (
+        f"{number} | [`{name}/`](../sq_perception/{name}/__init__.py) | {purpose(name)}"
+        for number in range(len(layers), 0, -1)
+        for name in layers[number - 1]
+    )
+    return table("layer | package | holds", rows)
 
 
 def purpose(package: str) -> str:
     """The beginning of a package's docstring, up to a colon or the end of the sentence."""
     docstring = ast.get_docstring(ast.parse((PACKAGE / package / "__init__.py").read_text(encoding="utf-8"))) or ""
     return re.split(r"[:.]\s|[:.]$", " ".join(docstring.split()), maxsplit=1)[0]
-
-
-def speed() -> str:
-    """What a frame costs, and where."""
-    found = {
-        name: row for name, row in results("speed")["rows"].items() if name == "thesis, auto" or name.endswith("own")
-    }
-    rows = []
-    for name, row in found.items():
-        shares = " | ".join(
-            " / ".join(f"{100 * one:.0f}" for one in row[part].values()) for part in ("stages", "kinds")
-        )
-        rows.append(f"{name.removesuffix(', own')} | {row['loops']:.1f} | {row['classic']:.1f} | {shares}")
-    shares = " | ".join(f"{' / '.join(next(iter(found.values()))[part])} %" for part in ("stages", "kinds"))
-    return table(f"frame | times a loop | times classic fits | {shares}", rows)
 
 
 def known() -> str:
@@ -253,19 +200,19 @@ def known() -> str:
     for kind in ("box", "cylinder", "bottle", "vessel", "other"):
         errors = f"{both(kind, 'iou', 100)} | {both(kind, 'error_median', 1e3)} | {both(kind, 'two_sigma', 100, 0)}"
         rows.append(f"{kind} | {groups[kind]['auto, given']['things']} | {errors}")
-    return table(f"things | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}", rows)
+    return table(f"objects | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}", rows)
 
 
 ABLATIONS = {
     "whole": "as shipped",
     "no predicted hull": "no predicted hull",
-    "as a body": "as a body, not as a hull",
+    "as a body": "fitted as a body, not as a hull",
     "no plane": "no support plane",
     "no free space": "no free space",
-    "missing is empty": "missing readings are empty space",
-    "half the error": "a predicted hull that errs by half",
-    "true behind": "the true hull on the far side alone",
-    "true hull": "the true hull in place of the predicted",
+    "missing is empty": "missing readings count as empty space",
+    "half the error": "predicted hull with half the error",
+    "true behind": "true hull on the far side only",
+    "true hull": "true hull instead of the predicted one",
 }
 """Rows of the ablation that are shown."""
 
@@ -278,7 +225,7 @@ def ablation() -> str:
         cells = " | ".join(f"{one[name]['iou']:.1f} ({one[name]['difference']:+.1f})" for one in found)
         rows.append(f"{text} | {cells}")
     household, recorded = (one["whole"]["count"] for one in found)
-    return table(f"fit | household, {household} things | recorded, {recorded} things", rows)
+    return table(f"fit | household, {household} objects | recorded, {recorded} objects", rows)
 
 
 def recorded() -> str:
@@ -296,7 +243,7 @@ def recorded() -> str:
 
 PICKERS = {
     "ours": "recovered bodies, covariance",
-    "ours without sigma": "with 10 % of the size as sigma",
+    "ours without sigma": "sigma of 10 % of the size",
     "ours without the hull": "without the predicted hull",
     "true bodies": "true bodies",
     "classic": "`classic` fit",
@@ -306,61 +253,17 @@ PICKERS = {
     "cgn": "Contact-GraspNet alone",
 }
 """Contestants of the picking benchmark; those that tried both kinds of scenes are shown."""
-FAILURES = ("collision", "wrong size", "missed", "slipped")
-GAINS = {
-    "ours without sigma": "covariance over 10 % of the size",
-    "ours without the hull": "predicted hull over release 0.2.0's predicted body",
-    "classic": "our fit over the classic one",
-    "cgn in masks": "over Contact-GraspNet in our masks",
-}
-"""Whom the picking benchmark compares ours with."""
 
 
 def picking() -> str:
-    """Grasps in physics: how often one holds, how much is cleared, and why others failed."""
+    """Share of grasps that hold and of objects that are removed, by contestant."""
     found = results("picking")["rows"]
     rows = []
     for who in (one for one in PICKERS if {f"packed: {one}", f"pile: {one}"} <= set(found)):
         kinds = [found[f"{kind}: {who}"] for kind in ("packed", "pile")]
-        cells = [f"{one['scenes']}: {_rate(one['gsr'])} / {_rate(one['dr'])}" for one in kinds]
-        tried = sum(one["tried"] for one in kinds)
-        *failed, unreachable = (sum(one["causes"][cause] for one in kinds) for cause in (*FAILURES, "unreachable"))
-        causes = f"{tried}: {' / '.join(map(str, failed))}"
-        rows.append(f"{PICKERS[who]} | {' | '.join(cells)} | {causes} | {unreachable}")
-    heads = f"planned on | packed, scenes: GSR / DR % | pile | tried: {' / '.join(FAILURES)} | unreachable"
-    return table(heads, rows)
-
-
-def picking_gains() -> str:
-    """What parts of the recovery are worth to grasps, and by how much others are behind."""
-    gains = results("picking")["gains"]
-    rows = []
-    for other, name in GAINS.items():
-        kinds = [gains[f"{kind}: ours over {other}"] for kind in ("packed", "pile")]
-        values = ["{:+.0f} ({:+.0f} to {:+.0f})".format(*kind[rate]) for kind in kinds for rate in ("gsr", "dr")]
-        scenes = " / ".join(dict.fromkeys(f"{kind['scenes'][0]:.0f}" for kind in kinds))
-        rows.append(" | ".join([f"{name}, {scenes}", *values]))
-    heads = "on the same scenes, points (95 % interval) | packed, GSR | packed, DR | pile, GSR | pile, DR"
-    return table(heads, rows)
-
-
-def picking_scores() -> str:
-    """Scores of ours against what held."""
-    runs = results("picking_scores")["rows"].values()
-    means = []
-    for k in range(5):
-        bins = [one["bins"][k] for one in runs if one["bins"][k][0]]
-        count = sum(one[0] for one in bins)
-        means.append([f"{100 * sum(one[0] * one[of] for one in bins) / count:.0f}" for of in (1, 2)] + [str(count)])
-    heads = ["score", *(f"{0.2 * k:.1f} to {0.2 * k + 0.2:.1f}" for k in range(5))]
-    names = ("mean score %", "held %", "tried")
-    rows = (" | ".join([name, *values]) for name, values in zip(names, zip(*means, strict=True), strict=True))
-    return table(" | ".join(heads), rows)
-
-
-def _rate(one: list[float]) -> str:
-    """A rate in per cent with its interval."""
-    return "{:.0f} ({:.0f}-{:.0f})".format(*one)
+        cells = " | ".join(f"{one['gsr'][0]:.0f} / {one['dr'][0]:.0f}" for one in kinds)
+        rows.append(f"{PICKERS[who]} | {cells}")
+    return table("planned on | packed: GSR / DR % | pile: GSR / DR %", rows)
 
 
 BLOCKS: dict[str, Callable[[], str]] = {
@@ -370,20 +273,13 @@ BLOCKS: dict[str, Callable[[], str]] = {
         household,
         kinds,
         prediction,
-        camera_spread,
         known,
         ablation,
         recorded,
         frame_time,
-        speed,
         latency,
-        still,
         picking,
-        picking_gains,
-        picking_scores,
-        tracks,
         cameras,
-        layers,
         packages,
     )
 }

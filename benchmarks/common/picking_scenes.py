@@ -24,7 +24,7 @@ from common.picking_world import Thing, World
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.union import flat_support, moved
+from sq_perception.geometry.union import flat_support, move
 from sq_perception.grasping.gripper import PANDA
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import draw_thing
@@ -107,7 +107,7 @@ def seen(world: World, bodies: list[Superquadric]) -> tuple[Superquadric, np.nda
     for k in world.left:
         if len(bodies[k]):
             position, rotation = world.pose(k)
-            rows.append(moved(moved(bodies[k].to_flat(), rotation, position), LOOK, EYE))
+            rows.append(move(move(bodies[k].to_flat(), rotation, position), LOOK, EYE))
             owner += [k] * len(bodies[k])
     return Superquadric.from_flat(np.concatenate(rows)), np.array(owner, dtype=int)
 
@@ -159,7 +159,7 @@ def _packed(rng: np.random.Generator) -> Poses | None:
         low = -float(flat_support(thing.parts.to_flat(), np.array([[0, 0, -1.0]]))[0])
         for _ in range(200):
             at = np.array([*rng.uniform(-HALF, HALF, 2), 1e-3 - low])
-            flat = moved(thing.parts.to_flat(), turn, at)
+            flat = move(thing.parts.to_flat(), turn, at)
             reach = flat_support(flat, _LEVEL)
             if all((-other - np.roll(reach, 18)).max() > GAP for other in flats):
                 break

@@ -26,7 +26,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.union import moved
+from sq_perception.geometry.union import move
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
 from sq_perception.simulation.camera_stages import Stages
@@ -68,7 +68,7 @@ def scene(kind: str, seed: int) -> SegmentationScene:
     sensor = "random"
     if rng.random() < _RANDOM_SENSOR:
         seen = labels > 0 if labels.any() else np.ones(labels.shape, bool)
-        measured = thing_sensing.measured_by_any(depth, seen, camera, Stages(), rng)
+        measured = thing_sensing.measure_by_any(depth, seen, camera, Stages(), rng)
     else:
         sensor = str(rng.choice(list(sensor_noise.PRESETS)))
         measured = sensor_noise.preset(sensor).measured(depth, camera, rng)
@@ -120,7 +120,7 @@ def _in_furniture(name: str) -> Callable[[np.random.Generator, Camera], _Drawn]:
 
 
 def _crowd(rng: np.random.Generator, camera: Camera) -> _Drawn:
-    depth, labels = crowds.crowded_scene(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
+    depth, labels = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
     return np.where(np.isnan(depth), np.inf, depth), labels
 
 
@@ -136,7 +136,7 @@ def _rendered(
     """Boxes in the table's frame; those from ``furniture_from`` on are no things."""
     table = quaternions.to_matrix(look)
     plane = np.append(table[:, 2], -table[:, 2] @ eye)
-    parts = Superquadric.from_flat(moved(np.array(rows), look, eye))
+    parts = Superquadric.from_flat(move(np.array(rows), look, eye))
     owner = np.arange(len(rows))
     depth, index = render_things(parts, owner, NO_CAVITY, owner[:0], camera, plane, wall)
     return depth, np.where(index < furniture_from, index + 1, 0)

@@ -1,4 +1,4 @@
-"""What all commands have in common: exit codes, complaints of one line, help texts, and checks of what was given."""
+"""Common parts of all commands: exit codes, one-line complaints, help texts, and checks of arguments."""
 
 from __future__ import annotations
 
@@ -16,18 +16,20 @@ from sq_perception.files import output_file
 if TYPE_CHECKING:
     from rich.progress import Progress
 
+    from sq_perception.recordings.cloud_frame import CloudFrame
+
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
-_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|-inf(inity)?", re.IGNORECASE)
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(,[-+.\de]*)*|-inf(inity)?", re.IGNORECASE)
 
 
 def complain(message: str) -> None:
-    """One line on the standard error; text of a recording must not steer the terminal."""
+    """Print one line to standard error, without control characters from recordings."""
     print(f"sq-perception: {printable(' '.join(message.split()))}", file=sys.stderr)
 
 
 class _Complaints(logging.Handler):
-    """What the package logs, as complaints."""
+    """Log handler that prints what the package logs as complaints."""
 
     def emit(self, record: logging.LogRecord) -> None:
         complain(record.getMessage())
@@ -41,31 +43,31 @@ def show_log() -> None:
 
 
 def printable(text: str) -> str:
-    """A text with question marks for what cannot be shown, such as bytes of a file's name that are no UTF-8."""
+    """Replace characters that cannot be printed, such as file name bytes that are no UTF-8, by question marks."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
 
-def failed(message: str) -> int:
-    """Complain of something that could not be done; returns its exit code."""
+def fail(message: str) -> int:
+    """Complain of a failure; return its exit code."""
     complain(message)
     return FAILURE
 
 
-def misused(message: str) -> int:
-    """Complain of wrong usage; returns its exit code."""
+def reject_usage(message: str) -> int:
+    """Complain of wrong usage; return its exit code."""
     complain(message)
     return USAGE
 
 
 class Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line, without twenty lines of usage before it."""
+    """Parser that reports an error in one line, without the usage."""
 
     def error(self, message: str) -> NoReturn:
         self.exit(USAGE, f"{self.prog}: {message}; {self.prog} --help shows all options\n")
 
 
 def parser(command: str, description: str, epilog: str | None = None) -> argparse.ArgumentParser:
-    """The parser of one command, whose texts keep their lines."""
+    """Make the parser of one command, whose texts keep their lines."""
     return Parser(
         prog=f"sq-perception {command}",
         description=description,
@@ -75,15 +77,15 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
 
 
 def with_negatives(arguments: Sequence[str]) -> list[str]:
-    """Arguments of a command that takes negative numbers, such that argparse takes none of them for an option.
+    """Prepare arguments with negative numbers, so that argparse takes none of them for an option.
 
-    It does so with -1e-3, -1. and -inf.  Each gets a blank in front, which ``float`` ignores.
+    It does so with -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores.
     """
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 
 def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
-    """The type of an argument that is a whole number from ``least`` to ``most``, or to no end."""
+    """Return the argument type of a whole number from ``least`` to ``most``, or without an upper bound."""
 
     def checked(text: str) -> int:
         try:
@@ -100,7 +102,7 @@ def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
 
 
 def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float]:
-    """The type of an argument that is a number for which ``holds`` is true; ``wanted`` names it in complaints."""
+    """Return the argument type of a number for which ``holds`` is true; ``wanted`` names it in complaints."""
 
     def checked(text: str) -> float:
         try:
@@ -118,7 +120,7 @@ positive = number("a positive number", lambda value: 0 < value < math.inf)
 
 
 def target(text: str) -> Path:
-    """The type of an argument that names a file to be written, which is tried."""
+    """Check an output file name, which is tried; an argument type."""
     if not Path(text).resolve().parent.is_dir():
         raise argparse.ArgumentTypeError(f"{text}: its folder does not exist")
     try:
@@ -129,14 +131,14 @@ def target(text: str) -> Path:
 
 
 def text_target(text: str) -> str:
-    """The type of an argument that names a file to be written, or is - for the standard output."""
+    """Check an output file name, or - for standard output; an argument type."""
     if text == STANDARD_OUTPUT and sys.stdout is None:
         raise argparse.ArgumentTypeError("the standard output is closed")
     return text if text == STANDARD_OUTPUT else str(target(text))
 
 
 def folder(text: str) -> Path:
-    """The type of an argument that names a folder for results, which is made if need be, and tried."""
+    """Make and check a folder for results; an argument type."""
     try:
         output_file.check_folder(text)
     except OSError as error:
@@ -149,7 +151,7 @@ def replaced_input(
     files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,
 ) -> str:
-    """A complaint if an output would replace an input; empty if none would.
+    """Complain if an output would replace an input; empty if none would.
 
     Parameters
     ----------
@@ -169,7 +171,7 @@ def replaced_input(
 
 
 def add_frames(command: argparse.ArgumentParser) -> None:
-    """Add the arguments that tell which recorded frames are read, and how bodies are recovered from them."""
+    """Add the arguments for recorded frames and their recovery."""
     add = command.add_argument
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
@@ -178,22 +180,22 @@ def add_frames(command: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="intrinsics of images and bags, before their own: a file of K, or fx,fy,cx,cy",
     )
-    add("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
-    add("--camera-info-topic", metavar="NAME", help="their camera_info, where it is not beside them")
+    add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
+    add("--camera-info-topic", metavar="NAME", help="camera_info topic, if it is not beside the depth topic")
     add_depth(command)
     add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
     methods = ("auto", "network", "symmetry", "classic")
-    add("--method", choices=methods, default="auto", help="how bodies are found: the methods of recover --help")
+    add("--method", choices=methods, default="auto", help="recovery method, see recover --help")
     add_ignore_masks(command)
 
 
 def add_depth(command: argparse.ArgumentParser) -> None:
-    """Add the options that tell what the numbers of depth images mean."""
+    """Add the options for the meaning of depth values."""
     command.add_argument(
         "--depth-scale",
         type=positive,
         metavar="N",
-        help="units a metre (as a camera file states, else 1000 of whole numbers, 1 of floats)",
+        help="units per metre (default: from a camera file, else 1000 for integers, 1 for floats)",
     )
     command.add_argument(
         "--depth-kind",
@@ -201,15 +203,31 @@ def add_depth(command: argparse.ArgumentParser) -> None:
         default="z",
         help="range: images hold the distance to the camera's centre (Isaac's distance_to_camera), not z",
     )
+    command.add_argument(
+        "--frame",
+        type=_cloud_frame,
+        metavar="POSE",
+        help="for clouds in another frame, where the camera is in it: X,Y,Z (it looks at the middle), "
+        "X,Y,Z,QX,QY,QZ,QW, or link (x forward, z up) or graphics (y up, z backward)",
+    )
+
+
+def _cloud_frame(text: str) -> CloudFrame:
+    from sq_perception.recordings.cloud_frame import CloudFrame
+
+    try:
+        return CloudFrame.parse(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def add_ignore_masks(command: argparse.ArgumentParser) -> None:
-    """Add the option that leaves the labels of frames unread."""
-    command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+    """Add the option that ignores the labels of frames."""
+    command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
 def progress() -> Progress:
-    """A bar on the standard error, where that is a terminal; to be used as a context manager."""
+    """Return a context manager for a progress bar on standard error, if that is a terminal."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 

@@ -1,6 +1,6 @@
-"""``sq-perception demo``: a simulated camera, recover_node and fitter_node, and how well both methods did.
+"""``sq-perception demo``: a simulated camera, recover_node and fitter_node, and the accuracy of both methods.
 
-The nodes run in this process and talk over ROS 2, in a domain of their own on this machine unless ROS_DOMAIN_ID or
+The nodes run in this process and communicate over ROS 2, in their own domain on this machine unless ROS_DOMAIN_ID or
 ROS_AUTOMATIC_DISCOVERY_RANGE are set.
 """
 
@@ -29,11 +29,11 @@ _SHOWN = """\
 {picture}   the last image: depth, recovered outlines, both methods in space
 {mesh}   the recovered bodies, for any glTF viewer
 What next: `sq-perception sample table.npz`, then `sq-perception recover table.npz --html page.html`; on a robot
-`ros2 run sq_perception recover_node` (README.md has the topics)."""
+`ros2 run sq_perception recover_node` (docs/nodes.md has the topics)."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception demo``; the exit code."""
+    """Run ``sq-perception demo``; return the exit code."""
     command = parser("demo", _HELP)
     add = command.add_argument
     above_0 = number("a number above 0", lambda value: value > 0)
@@ -52,7 +52,7 @@ def main(arguments: Sequence[str]) -> int:
         from sq_perception.nodes.demo_node import DemoNode
 
         print("starting a camera, recover_node and fitter_node; Ctrl-C ends", flush=True)
-        watching.append(process.made(DemoNode, "demo", tuple(_METHODS), options.seconds))
+        watching.append(process.make(DemoNode, "demo", tuple(_METHODS), options.seconds))
         yield watching[0]
         for name in (*_METHODS, "synthetic_depth_node"):
             yield executables.create_node(name)
@@ -78,13 +78,13 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
     print(f"{len(shots)} images of a simulated RealSense D435, {count} bodies on tables\n")
     print(f"{'':15}{'found':>9}{'IoU mean':>11}{'worst':>8}{'stamp to result':>18}")
     for node, title in _METHODS.items():
-        pairs = [pair for shot in shots for pair in paired(shot.truth, shot.found[node])]
+        pairs = [pair for shot in shots for pair in pair(shot.truth, shot.found[node])]
         overlaps = [100 * overlap for found, overlap in pairs if found is not None] or [0.0]
         delay = np.median([shot.delay[node] for shot in shots])
         share = 100 * len(overlaps) / count
         print(f"{title:15}{share:7.0f} %{np.mean(overlaps):9.1f} %{min(overlaps):6.0f} %{delay:15.0f} ms")
     last = shots[-1]
-    columns = {title: paired(last.truth, last.found[node]) for node, title in _METHODS.items()}
+    columns = {title: pair(last.truth, last.found[node]) for node, title in _METHODS.items()}
     print("\nthe last image, full edges in mm, shortest first")
     print(f"   {'true':22}" + "".join(f"{title:30}" for title in columns))
     for k, body in enumerate(last.truth):
@@ -100,8 +100,8 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
     print("\n" + _SHOWN.format(picture=picture, mesh=mesh))
 
 
-def paired(truth: Superquadric, found: Superquadric) -> list[tuple[Superquadric | None, float]]:
-    """For each true body (n,) the found one (m,) that overlaps it most, and their IoU; None where none does."""
+def pair(truth: Superquadric, found: Superquadric) -> list[tuple[Superquadric | None, float]]:
+    """Return the best overlapping found body (m,) of each true body (n,) and their IoU; None for no overlap."""
     from sq_perception.geometry.metrics import volume_iou
 
     pairs: list[tuple[Superquadric | None, float]] = []

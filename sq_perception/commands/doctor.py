@@ -1,4 +1,4 @@
-"""``sq-perception doctor``: versions, extras, kernels, weights and cores, and what to do about what is missing."""
+"""``sq-perception doctor``: versions, extras, kernels, weights and cores, and how to install what is missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ _PACKAGE = Path(__file__).parents[1]
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "exr": ("OpenEXR",),
-    "cluster": ("distributed",),
     "train": ("torch",),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
@@ -27,7 +26,7 @@ _EXTRAS = {
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception doctor``; the exit code."""
+    """Run ``sq-perception doctor``; return the exit code."""
     parser("doctor", _HELP).parse_args(arguments)
     faults = 0
     for what, finding, is_fault in findings():
@@ -37,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def findings() -> Iterator[tuple[str, str, bool]]:
-    """What was looked at, what was found, and whether nothing works without it."""
+    """Return what was checked, the result, and whether it is essential."""
     from sq_perception.files import provenance
 
     yield "program", f"sq_perception {__version__}, Python {platform.python_version()}, {_PACKAGE}", False
@@ -74,7 +73,7 @@ def _weights() -> tuple[str, bool]:
 
 
 def _kernels() -> tuple[str, bool]:
-    """Whether code of these sources is kept: names of files end in a digest of them, and older files are not used."""
+    """Return whether the kernels of these sources are cached: file names end in a digest of the sources."""
     try:
         from sq_perception.geometry import kernels
     except ImportError as error:

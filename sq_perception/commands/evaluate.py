@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, failed, folder, parser, progress
+from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, fail, folder, parser, progress
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ _HELP = """\
 Compare networks and fits on one test set of the thesis' protocol, and write its tables 6.1 to 6.3 and 7.1 to 7.4 with
 the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), and examples.
 
-A network takes part alone, unrefined, from the 256 x 256 image on; the loss in its file's header decides its row of the
-thesis.  Fits: auto (network and surface fit), symmetry (surface fit alone), classic (Solina and Bajcsy).
+Networks are evaluated without a fit, from the 256 x 256 image; the loss in the file's header selects the row of the
+thesis.  Fits: auto (network and surface fit), symmetry (surface fit only), classic (Solina and Bajcsy).
 """
 _EPILOG = """\
 writes into --output:
@@ -28,9 +28,9 @@ writes into --output:
   results.json   every figure, the command, versions, processor, commit and seeds
   *.png          the pictures
 
-A model file that cannot be read is reported and left out; the exit code is then 1.  The bodies are those of no
-training, and the first n are the same for every --bodies.  Expect 7 ms a body to draw the images, and 10 ms for each
-network and 15 ms for each fit; times of execution mean something on a quiet machine only.
+Unreadable model files are reported and skipped; the exit code is then 1.  No training uses these bodies, and the first
+n are the same for every --bodies.  Expect 7 ms per body for the images, 10 ms per network and 15 ms per fit; execution
+times are meaningful only on an idle machine.
 
 examples:
   sq-perception evaluate
@@ -40,7 +40,7 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception evaluate``; the exit code, which is that of a failure if a model could not be read."""
+    """Run ``sq-perception evaluate``; return the exit code, a failure if a model could not be read."""
     command = parser("evaluate", _HELP, _EPILOG)
     add = command.add_argument
     add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
@@ -70,7 +70,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
     for failure in failures:
         complain(failure)
     if not contestants:
-        return failed("nothing is left to evaluate")
+        return fail("nothing is left to evaluate")
     images = ThesisImages(max(count for _, count in contestants), options.seed)
     with progress() as bar:
         tasks = {contestant.name: bar.add_task(contestant.name, total=count) for contestant, count in contestants}
@@ -88,7 +88,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
 
 
 def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
-    """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
+    """Return the contestants with their number of bodies, and the errors of those that cannot take part."""
     from sq_perception.evaluation.contest import fit, network, unique_names
     from sq_perception.learning.checkpoint import CheckpointError, shipped_regressors
 

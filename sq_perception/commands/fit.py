@@ -15,9 +15,9 @@ from sq_perception.commands.console import (
     SUCCESS,
     at_least,
     complain,
-    misused,
     parser,
     positive,
+    reject_usage,
     text_target,
 )
 
@@ -25,14 +25,14 @@ FORMAT, VERSION = "sq_perception.points", 1
 HELP = """\
 Fit superquadrics to point clouds or meshes of single objects, seen from all sides or some.
 
-A FILE is a cloud (.pcd, .ply, .npy of shape (n, 3)) or a mesh (.ply, .obj, .stl, .off), in any unit and frame: bodies
-come back in the same.  A depth image, or a cloud that one camera took, is for 'sq-perception recover'.
+A FILE is a cloud (.pcd, .ply, .npy of shape (n, 3)) or a mesh (.ply, .obj, .stl, .off), in any unit and frame; bodies
+have the same.  For a depth image, or a cloud from one camera, use 'sq-perception recover'.
 """
 EPILOG = """\
-a line a body:
+one line per body:
   0 converged 480.0 x 196.0 x 214.0 (+-5.1 +-11.0 +-7.2) at 0.120 0.030 0.840, 62 % of the points
-  Its status, FULL edges with their standard deviations in thousandths of the file's unit (mm where that is metres), its
-  centre, and the share of the points that it explains.
+  Status, FULL edges with standard deviations in thousandths of the file's unit (mm if that is metres), centre, and
+  share of the points that the body explains.
 
 examples:
   sq-perception fit mug.ply
@@ -41,19 +41,19 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception fit``; the exit code."""
+    """Run ``sq-perception fit``; return the exit code."""
     command = parser("fit", HELP, EPILOG)
     add = command.add_argument
     add("files", nargs="+", metavar="FILE", help="clouds or meshes of one object each")
     add(
-        "--most", type=at_least(1, 20), default=1, metavar="N", help="at most N bodies, as many as it takes (default 1)"
+        "--most", type=at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)"
     )
-    add("--sigma", type=positive, metavar="S", help="noise of the points in their unit; estimated if not given")
-    add("--no-taper", action="store_true", help="bodies of one section from end to end (of one body only)")
+    add("--sigma", type=positive, metavar="S", help="noise of the points in their unit (default: estimated)")
+    add("--no-taper", action="store_true", help="fit no taper (one body only)")
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     options = command.parse_args(arguments)
     if options.no_taper and options.most > 1:
-        return misused("--no-taper: only with one body")
+        return reject_usage("--no-taper: only with one body")
     return _run(options)
 
 
@@ -65,11 +65,11 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.cloud_file import read_surface
 
     if options.json and Path(options.json).resolve() in {Path(name).resolve() for name in options.files}:
-        return misused(f"--json: {options.json} is read as well")
+        return reject_usage(f"--json: {options.json} is read as well")
     code, entries = SUCCESS, []
     for name in options.files:
         try:
-            entry = _fitted(name, read_surface(Path(name)), options)
+            entry = _fit(name, read_surface(Path(name)), options)
         except (UnpackingError, OSError, ValueError) as error:
             complain(f"{name}: {error}")
             code = FAILURE
@@ -89,7 +89,7 @@ def _run(options: argparse.Namespace) -> int:
     return code
 
 
-def _fitted(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]:
+def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]:
     from sq_perception.fitting.decomposition import Parts, decompose
     from sq_perception.fitting.fit import Fit
     from sq_perception.fitting.points import fit_points, surface_of

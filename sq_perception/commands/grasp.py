@@ -1,10 +1,18 @@
-"""``sq-perception grasp``: recorded frames in; grasps of what is on the table out, as JSON, pictures and meshes."""
+"""``sq-perception grasp``: recorded frames in; grasps out, as JSON, pictures and meshes."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import add_depth, add_ignore_masks, folder, parser, positive, text_target
+from sq_perception.commands.console import (
+    add_depth,
+    add_ignore_masks,
+    folder,
+    parser,
+    positive,
+    text_target,
+    with_negatives,
+)
 
 HELP = """\
 Plan grasps of a parallel gripper on the objects of recorded depth images.
@@ -17,10 +25,9 @@ output:
    "frames": [{"file": ..., "stamp": {"sec": ..., "nanosec": ...}, "bodies": [{"body": ..., "label": ..., "reason": ...,
    "grasps": [{"position": [x, y, z], "rotation": [x, y, z, w], "opening": ..., "width": ..., "score": ...,
    "weakest": ...}, ...]}, ...]}, ...]}
-  Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z the approach, y the
-  way of the fingers.  "score" is the probability that the grasp holds, the best first; "weakest" what takes most from
-  it.  Bodies are numbered as `recover` numbers them; one without a grasp has the reason.  The stamp is null where a
-  frame has none.
+  Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z is the approach, y
+  the closing direction.  "score" is the probability that the grasp holds, best first; "weakest" its smallest factor.
+  Bodies are numbered as in `recover`; one without a grasp has a reason.  The stamp is null if the frame has none.
 
 examples:
   sq-perception grasp table.npz --json grasps.json --pictures pictures/
@@ -29,20 +36,20 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception grasp``; the exit code."""
+    """Run ``sq-perception grasp``; return the exit code."""
     command = parser("grasp", HELP, EPILOG)
     add = command.add_argument
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     add("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
-    add("--friction", type=positive, help="between pads and things at the least (default 0.5)")
+    add("--friction", type=positive, help="smallest friction coefficient between pads and objects (default 0.5)")
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
-    add("--topic", metavar="TOPIC", help="the depth topic of a bag that has several")
+    add("--topic", metavar="TOPIC", help="depth topic of a bag, if it has several")
     add_depth(command)
     add_ignore_masks(command)
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
-    options = command.parse_args(arguments)
+    options = command.parse_args(with_negatives(arguments))
 
     from sq_perception.commands import grasp_run
 

@@ -1,4 +1,4 @@
-"""What ``sq-perception grasp`` does with its frames: recover, plan, and write JSON, pictures and meshes."""
+"""The run of ``sq-perception grasp``: recover, plan, and write JSON, pictures and meshes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from sq_perception.commands import console
-from sq_perception.commands.console import STANDARD_OUTPUT, complain, failed, misused
+from sq_perception.commands.console import STANDARD_OUTPUT, complain, fail, reject_usage
 from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry import mesh
+from sq_perception.geometry import kernel_cache, mesh
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import planner
 from sq_perception.grasping.gripper import Gripper, gripper
@@ -38,20 +38,23 @@ _LONGEST = 10.0
 
 
 def run(options: argparse.Namespace) -> int:
-    """What the command does with these options; the exit code."""
+    """Run the command with these options; return the exit code."""
+    kernel_cache.compile_beside()
     try:
         hand = gripper(options.gripper)
     except ValueError as error:
-        return misused(str(error))
+        return reject_usage(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        reading = Reading(options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind)
+        reading = Reading(
+            options.depth_scale, ignore_masks=options.ignore_masks, kind=options.depth_kind, frame=options.frame
+        )
         recorded = RecordedInput(
             options.frames, InputOptions(options.camera_info, topic=options.topic, reading=reading)
         )
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
-            return misused(problem)
+            return reject_usage(problem)
         entries: list[dict[str, Any]] = []
         code, is_whole = _plan_all(recorded, Recoverer(), hand, friction, options, entries)
         chosen = {"gripper": hand.name, "friction": friction}
@@ -67,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
         _print_table(entries)
         return code
     except (FrameError, CheckpointError, OSError) as error:
-        return failed(str(error))
+        return fail(str(error))
 
 
 def _plan_all(
@@ -78,16 +81,16 @@ def _plan_all(
     options: argparse.Namespace,
     entries: list[dict[str, Any]],
 ) -> tuple[int, bool]:
-    """Add the elements of ``frames`` to ``entries``; returns the exit code, and whether all frames were tried."""
+    """Append the elements of ``frames`` to ``entries``; return the exit code and whether all frames were tried."""
     code = console.SUCCESS
     stems: set[str] = set()
     try:
         for file, frame in recorded:
             if isinstance(frame, FrameError):
-                code = failed(str(frame))
+                code = fail(str(frame))
                 continue
             if frame.is_cube:
-                code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
+                code = fail(f"{file}: a view of the unit cube has no metres to grasp in")
                 continue
             for text in filter(None, (frame.warning, frame.notes)):
                 complain(f"{file}: {text}")
@@ -95,7 +98,7 @@ def _plan_all(
             try:
                 bodies = _bodies(stem, frame, recoverer, hand, friction, options)
             except (ValueError, ArithmeticError) as error:  # such as a camera of no image
-                code = failed(f"{file}: {frame.name}: {error}")
+                code = fail(f"{file}: {frame.name}: {error}")
                 continue
             stamp = None if frame.stamp is None else frame.stamp._asdict()
             entries.append({"file": plain_name(file), "stamp": stamp, "bodies": bodies})
@@ -103,14 +106,14 @@ def _plan_all(
         complain("interrupted; what is done so far is kept")
         return console.INTERRUPTED, False
     except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
-        return failed(str(error)), False
+        return fail(str(error)), False
     return code, True
 
 
 def _bodies(
     stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """The element ``bodies`` of a frame, numbered as by ``recover``; writes its picture and mesh if wanted."""
+    """Return a frame's element ``bodies``, numbered as by ``recover``; write its picture and mesh if requested."""
     settings = RecoveryOptions(free_space=frame.has_free_space)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:
@@ -159,7 +162,7 @@ def _draw(
 
 
 def _write_mesh(path: Path, found: Sequence[Recovery], numbers: Sequence[int], plan: GraspPlan, hand: Gripper) -> None:
-    """Bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
+    """Write the bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
     solids = [recovered.superquadric for recovered in found]
     names = [f"body_{k}" for k in numbers]
     owner = list(numbers)
@@ -167,7 +170,8 @@ def _write_mesh(path: Path, found: Sequence[Recovery], numbers: Sequence[int], p
         for grasp in plan.of(place)[:1]:
             boxes = hand.boxes(grasp.opening, reach=0.0)
             for name, box in zip(("left", "right", "hand"), boxes, strict=True):
-                solids.append(Superquadric(box[3:], np.full(2, _SHARP), grasp.placed(box[None, :3])[0], grasp.rotation))
+                centre = grasp.to_body_frame(box[None, :3])[0]
+                solids.append(Superquadric(box[3:], np.full(2, _SHARP), centre, grasp.rotation))
                 names.append(f"grasp_{k}_{name}")
                 owner.append(k)
     with output_file.writing(path) as partial:

@@ -1,9 +1,9 @@
-"""The command ``sq-perception``; ``sq-perception --help`` lists what it can do.
+"""The command ``sq-perception``; ``sq-perception --help`` lists its commands.
 
-Every command is a function of a module, ``(arguments) -> exit code``.  None is imported before it is called, and each
-imports what computes only after its arguments were understood, so that every ``--help`` answers at once.
+Every command is a function of a module, ``(arguments) -> exit code``.  It is imported when it is called, and imports
+numeric modules only after parsing its arguments, so that every ``--help`` answers at once.
 
-Exit codes: 0 all went well, 1 something could not be read, written or found, 2 wrong usage, 130 interrupted.
+Exit codes: 0 success, 1 something could not be read, written or found, 2 wrong usage, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ COMMANDS = {
     "dataset": ("dataset:main", "write a fixed set of training and test images"),
     "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
     "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
-    "warm-up": ("warm_up:main", "compile everything once, so that no first image waits"),
+    "warm-up": ("warm_up:main", "compile all kernels in advance"),
 }
 """Name, module of this folder and its function, and summary."""
 
@@ -50,7 +50,7 @@ examples:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; returns the exit code."""
+    """Run one command; return the exit code."""
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # before it is imported: what a file lacks is said here
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # the name of a file need not be UTF-8, nor the terminal

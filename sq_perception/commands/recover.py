@@ -1,7 +1,7 @@
 """``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
 
-Whether everything can be written is known before the first frame is read, and what was there before is kept until there
-is something better (:mod:`sq_perception.commands.recover_outputs`).
+Outputs are checked before the first frame is read, and existing files are kept until a complete result replaces them
+(:mod:`sq_perception.commands.recover_outputs`).
 """
 
 from __future__ import annotations
@@ -27,108 +27,109 @@ HELP = """\
 Recover superquadrics from recorded depth images.
 
 A FRAME is
-  .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
-                 then used instead of an own segmentation
+  .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, used instead
+                 of segmentation
   an image       PNG, TIFF or NPY of 16 bit (millimetres), TIFF, NPY or EXR (extra 'exr') of floats (metres), or see
                  --depth-scale; 0 = no reading, as is the type's largest number, and what many pixels share beyond all
                  others; with --camera-info, a camera file beside it, or a YAML of its name
-  .pcd, .ply     a point cloud in the optical frame; a PCD that is an image of a pinhole camera is taken as one
+  .pcd, .ply     a point cloud in the optical frame, or see --frame; a PCD that is an image of a pinhole camera is taken
+                 as one; a field instance or label of the points, 0 for none, holds masks; also .npz with points
+                 (n, 3) or (height, width, 3) and optional labels
   .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
-  a folder       all frames in it, in natural order, or those of its subfolders (four levels) where it has none;
-                 camera_info.yaml, camera.json, scene_camera.json, intrinsics.json ... in it is their camera
+  a folder       all its frames in natural order, or else those of its subfolders (four levels); their camera is
+                 camera_info.yaml, camera.json, scene_camera.json, intrinsics.json ... in it
   a rosbag2      a folder with metadata.yaml, or a .mcap or .db3 file: 16UC1 and 32FC1 images, raw or compressedDepth,
                  with the camera_info beside their topic, and masks on mask/image; needs no ROS, but the extra 'bags'
 
-What cannot be read is reported and skipped; the exit code is then 1.
+Unreadable frames are reported and skipped; the exit code is then 1.
 """
 EPILOG = """\
 methods:
-  auto       a surface fit with a network's help (best)
-  symmetry   the same fit, without the network
-  network    the network alone
+  auto       network and surface fit (best)
+  symmetry   surface fit only
+  network    network only
   classic    Solina and Bajcsy's fit to the points
 
 examples:
   sq-perception recover table.npz --json out.json --pictures pictures/
   sq-perception recover depth_*.png --camera-info 525,525,319.5,239.5 --csv out.csv --html out.html
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
-  sq-perception recover thousand_frames/ --jobs 8 --jsonl out.jsonl    # again after Ctrl-C: goes on
-  sq-perception recover thousand_frames/ --cluster tcp://10.0.0.1:8786 --jsonl out.jsonl
+  sq-perception recover thousand_frames/ --jobs 8 --jsonl out.jsonl    # continues after Ctrl-C
   sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover left.npz right.npz --poses poses.txt --json scene.json
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
 
-a line a body:
+one line per body:
   0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m
-  Its place in "superquadrics" and in the meshes, its status, FULL edges with their standard deviations, its centre.
+  Index in "superquadrics" and in the meshes, status, FULL edges with standard deviations, centre.
   What weak and failed mean, and what to do with them: docs/how_sure.md.
 
 files:
-  What is there stays until something better can take its place: a result that was interrupted is put beside a file as
-  NAME.partial.SUFFIX, and one of no frame at all replaces none.  Devices, FIFOs and links are written through.
-  --jsonl FILE grows by a line a frame; the same command with the same file skips the frames that are in it.
-  JSON has HALF sizes in metres; sq_perception/recordings/result.schema.json describes every field of it.  CSV has a row
-  a body, with the same numbers.  Positions are in the optical frame (x right, y down, z forward); those of orthographic
-  frames in the unit cube (x right, y up, z to the viewer).  A file whose name is a time (1305031102.160407.png) has
-  that stamp.
+  Existing files are replaced only by complete results: an interrupted run writes NAME.partial.SUFFIX, and a run without
+  any frame writes nothing.  Devices, FIFOs and links are written through.
+  --jsonl FILE grows by one line per frame; the same command with the same file skips the frames in it.
+  JSON has HALF sizes in metres; sq_perception/recordings/result.schema.json describes every field.  CSV has one row per
+  body with the same numbers.  Positions are in the optical frame (x right, y down, z forward), of orthographic frames
+  in the unit cube (x right, y up, z to the viewer).  A file named by a time (1305031102.160407.png) has that stamp.
 
 camera files:
-  K as camera_info, OpenCV, librealsense, Open3D, BOP, Kalibr, NeRF, COLMAP, ORB-SLAM, ScanNet and others write it, or a
-  text or NPZ of K or fx fy cx cy.  The size is the image's where the file has none.  A depth_scale in it is used.
+  K as written by camera_info, OpenCV, librealsense, Open3D, BOP, Kalibr, NeRF, COLMAP, ORB-SLAM, ScanNet and others, or
+  a text or NPZ of K or fx fy cx cy.  If the file has no size, the image's is used.  A depth_scale in it is applied.
 
 distortion:
-  Where a camera_info has distortion coefficients that are not zero, --distortion auto takes images for rectified if the
-  last two parts of their topic or path have the word rect or rectified in them (image_rect, image_rect_raw,
-  rect/image.png), and for raw otherwise.  Raw images are rectified: their camera is then that of K, in a window that
-  shows what the raw image shows.  models: plumb_bob, rational_polynomial, equidistant.
+  If a camera_info has nonzero distortion coefficients, --distortion auto treats images as rectified if the last two
+  parts of their topic or path contain the word rect or rectified (image_rect, image_rect_raw, rect/image.png), and
+  otherwise rectifies them: their camera is then that of K, in a window that shows what the raw image shows.
+  models: plumb_bob, rational_polynomial, equidistant.
 
 tracking:
-  --track follows bodies over the frames of each bag and folder, for a camera that stands still (docs/tracking.md);
-  "track" has the numbers of all frames so far.  With --jobs or --cluster each frame is recovered for itself.
+  --track follows bodies over the frames of each bag and folder, for a static camera (docs/tracking.md); "track" has the
+  numbers fused so far.  With --jobs each frame is recovered independently.
 
 several cameras:
-  --poses FILE takes all frames as views of one scene that rests, and prints at the end what they say together, in the
-  world of the poses ("scene" in --json).  FILE has a line a frame as in TUM RGB-D: NAME tx ty tz qx qy qz qw, camera to
-  world in metres; NAME is the frame's file, its topic or its stamp in seconds.
+  --poses FILE fuses all frames as views of one static scene and prints the result at the end, in the world of the poses
+  ("scene" in --json).  FILE has one line per frame as in TUM RGB-D: NAME tx ty tz qx qy qz qw, camera to world in
+  metres; NAME is the frame's file, its topic or its stamp in seconds.
 
 bags:
-  --mcap writes what recover_node would have published, and what it would have read (docs/bags.md).
+  --mcap writes what recover_node would have published and read (docs/bags.md).
 
 meshes:
-  One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
-  has the coordinates of the JSON.  GLB turns the optical frame half about x, as its y axis points up, and names each
-  body by its place in "superquadrics": body_0, body_1, ...
+  One file per frame with all its bodies, in metres, coloured as in the pictures; none for a frame without bodies.  PLY
+  has the coordinates of the JSON.  GLB, whose y axis points up, turns them by 180 degrees about x and names each body
+  by its index in "superquadrics": body_0, body_1, ...
 
 obstacles:
-  --export writes a file a frame for planners and simulators, in metres, in the frame of the JSON.  Each body is the
-  box, cylinder, sphere or capsule (not in URDF) of the least volume that encloses it; --inflate makes it larger by what
-  is not known of it.  Meshes of URDF and SDF are STL files beside it.
+  --export writes one file per frame for planners and simulators, in metres, in the frame of the JSON.  Each body is
+  the smallest enclosing box, cylinder, sphere or capsule (not in URDF); --inflate enlarges it by its uncertainty.
+  Meshes of URDF and SDF are STL files beside it.
 """
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception recover``; the exit code."""
+    """Run ``sq-perception recover``; return the exit code."""
     command = parser("recover", HELP, EPILOG)
     add_frames(command)
     add = command.add_argument
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
-    add("--jsonl", type=text_target, metavar="OUT", help="a line for each frame; those it has are skipped, see below")
+    add("--jsonl", type=text_target, metavar="OUT", help="append a line per frame, skip those already there, see below")
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
     add("--html", type=target, metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
-    add("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
-    add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
+    add("--depth-min", type=float, default=0.0, metavar="M", help="metres; ignore nearer readings")
+    add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; ignore farther readings")
     add(
         "--roi",
         type=_region,
         metavar="X,Y,W,H",
-        help="only this part of each image, in pixels, after distortion was undone",
+        help="use only this part of each image, in pixels, after rectification",
     )
-    add("--masks", type=_existing, metavar="DIR", help="label images, one a frame: its name and .png, 0 is background")
+    masks = "label images NAME.png, 0 is background, or binary ones, NAME_000000.png ... (BOP)"
+    add("--masks", type=_existing, metavar="DIR", help=masks)
     add(
         "--distortion",
         choices=("auto", "apply", "ignore"),
         default="auto",
-        help="undo it, take images for rectified, or go by their names; see below",
+        help="rectify images, assume they are rectified, or decide by their names; see below",
     )
     add("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
@@ -137,52 +138,51 @@ def main(arguments: Sequence[str]) -> int:
     add(
         "--export", choices=("urdf", "sdf", "mjcf", "curobo"), help="write the bodies of each frame as obstacles, below"
     )
-    add("--export-folder", type=folder, metavar="DIR", default=Path(), help="where to (default: here)")
-    add("--export-meshes", action="store_true", help="as close meshes, not as the smallest enclosing solids")
+    add("--export-folder", type=folder, metavar="DIR", default=Path(), help="folder of the scenes (default: here)")
+    add("--export-meshes", action="store_true", help="as close meshes instead of enclosing solids")
     add(
         "--inflate",
         type=number("a number from 0", lambda value: value >= 0),
         default=0.0,
         metavar="K",
-        help="make them larger by K standard deviations",
+        help="enlarge them by K standard deviations",
     )
     add("--mcap", type=target, metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
     add(
         "--mcap-images",
         metavar="LIST",
         default="depth",
-        help="its images: depth (default), rendered, labels, with commas, or none",
+        help="images of the bag, comma separated: depth (default), rendered, labels, or none",
     )
     add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    add("--track", action="store_true", help="follow bodies over the frames of each bag or folder, see below")
-    add("--poses", type=Path, metavar="FILE", help="camera poses of the frames: they show one scene, see below")
+    add("--track", action="store_true", help="track bodies over the frames of each bag or folder, see below")
+    add("--poses", type=Path, metavar="FILE", help="camera poses of frames that show one scene, see below")
     add(
         "--time-budget",
         type=positive,
         default=math.inf,
         metavar="S",
-        help="seconds per frame after which no new start is tried",
+        help="seconds per frame after which fits try no further start",
     )
     add(
         "--jobs",
         type=at_least(1),
         default=1,
         metavar="N",
-        help="frames at a time, in processes of one thread (1: one, its objects in threads)",
+        help="number of frames processed in parallel (1: the objects of one frame in parallel)",
     )
-    add("--cluster", metavar="ADDRESS", help="a running Dask cluster whose workers have this package (extra 'cluster')")
     score = number("a score from 0 to 1", lambda value: 0 <= value <= 1)
     add("--min-score", type=score, default=0.0, metavar="S", help="leave out bodies with a lower score, 0 to 1")
-    add("-q", "--quiet", action="store_true", help="no table and no summary; errors only")
-    add("-v", "--verbose", action="store_true", help="also the time of each stage, and the log")
-    add("--max-objects", type=at_least(1), default=20, metavar="N", help="largest ones first (default 20)")
+    add("-q", "--quiet", action="store_true", help="print errors only")
+    add("-v", "--verbose", action="store_true", help="also print stage times and the log")
+    add("--max-objects", type=at_least(1), default=20, metavar="N", help="most objects, the largest first (default 20)")
     add("--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)")
     add(
         "--workspace",
         type=float,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="box of the optical frame, metres, that the middle of an object lies in",
+        help="box in the optical frame, metres, for the centres of objects",
     )
     options = command.parse_args(with_negatives(arguments))
 

@@ -1,8 +1,8 @@
-"""What ``sq-perception recover`` prints of the frames: a line a body, each reason once, details where they are wanted.
+"""The lines that ``sq-perception recover`` prints: one per body, each reason once, details on request.
 
     0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m
 
-The number is the body's place in ``superquadrics``, as in meshes and pictures.
+The number is the body's index in ``superquadrics``, as in meshes and pictures.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _AXES = re.compile(" along [xyz]( and [xyz])*")
 
 
 def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
-    """All frames, then the reasons with the number of bodies that they hold for."""
+    """Return the lines of all frames, then the reasons with their number of bodies."""
     reasons: Counter[tuple[str, str]] = Counter()
     for entry in entries:
         stamp = entry["stamp"]
@@ -42,7 +42,7 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
 
 
 def scene_lines(scene: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """The bodies of all frames together, in the world of their camera poses."""
+    """Return the lines of the bodies of all frames together, in the world of their camera poses."""
     for body in scene:
         edges, place = edges_as_text(body["size"], body["sigma_size"], False), place_as_text(body["translation"], False)
         yield f"  {body['status']} {edges} at {place} id {body['id']}, in {body['seen']} frames"

@@ -1,6 +1,6 @@
-"""The files that ``sq-perception recover`` writes: looked at before the first frame, and finished after the last one.
+"""The files that ``sq-perception recover`` writes: checked before the first frame, and finished after the last one.
 
-What is wrong with a name comes back as a sentence; :mod:`sq_perception.files.output_file` is how files are replaced.
+Errors of names are returned as sentences; :mod:`sq_perception.files.output_file` replaces files.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _DECISIVE = (
 
 
 def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
-    """Which output would take the place of an input, or of another output; empty if none."""
+    """Return which output would replace an input or another output; empty if none."""
     files = {name: getattr(options, name) for name in _FILES}
     taken: dict[Path, str] = {}
     for name, file in files.items():
@@ -74,7 +74,7 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
 
 
 def _decisive(options: argparse.Namespace) -> dict[str, Any]:
-    """Options that decide what is found in a frame, as JSON values; what was not given or has no end is None."""
+    """Return the options that affect the results, as JSON values; None for no value or no limit."""
     values = {name: getattr(options, name) for name in _DECISIVE}
     sides = values["workspace"]
     values["workspace"] = sides and [side if math.isfinite(side) else None for side in sides]
@@ -84,7 +84,7 @@ def _decisive(options: argparse.Namespace) -> dict[str, Any]:
 
 
 class Outputs:
-    """Everything that is written of a run, open before the first frame.
+    """All outputs of a run, open before the first frame.
 
     Attributes
     ----------
@@ -151,7 +151,7 @@ class Outputs:
         tracks: Sequence[Followed] | None,
         entry: dict[str, Any],
     ) -> None:
-        """Write a frame, what was recovered from it, and its element of ``frames``; raises OSError if that fails."""
+        """Write a frame, its recovery, and its element of ``frames``; raises OSError on failure."""
         options = self._options
         self.results.append(entry)
         stem = output_file.free_name(_stem(entry), self._stems)
@@ -174,7 +174,7 @@ class Outputs:
             self._lines.add(entry)
 
     def finish(self, whole: bool) -> Iterator[str]:
-        """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
+        """Close growing files and write the documents; return one sentence per failure or other destination.
 
         ``whole``: whether all frames were tried.
         """
@@ -208,13 +208,13 @@ class Outputs:
 
 
 def _stem(entry: Mapping[str, Any]) -> str:
-    """What the picture and the meshes of a frame are called, unless another frame has that name, by its element."""
+    """Return the file stem of a frame's picture and meshes by its element, unless another frame has it."""
     path = Path(entry["file"])
     return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
 
 
 def _has_body(entry: Mapping[str, Any]) -> bool:
-    """Whether an element of ``frames`` has a body that did not fail, and so a mesh."""
+    """Return whether an element of ``frames`` has a body that did not fail, and so a mesh."""
     statuses = [body.get("status") for body in entry["superquadrics"] if isinstance(body, Mapping)]
     return any(status != Status.FAILED.name.lower() for status in statuses)
 
@@ -249,7 +249,7 @@ def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:
 
 
 def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    """The picture of a frame."""
+    """Draw the picture of a frame."""
     from sq_perception.evaluation.plots import save
     from sq_perception.evaluation.recovery_figure import recovery_figure
 
@@ -257,7 +257,7 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    """The bodies of a frame; no file where there is none."""
+    """Write the bodies of a frame; no file if there are none."""
     shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     if not shown:
         return
@@ -272,7 +272,7 @@ def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> No
 
 
 def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, options: argparse.Namespace) -> None:
-    """The bodies of a frame as obstacles, no file where there is none; FrameError for a frame without metres."""
+    """Write the bodies of a frame as obstacles, no file if there are none; FrameError for a frame without metres."""
     shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     if not shown:
         return
@@ -283,7 +283,7 @@ def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, opti
         covariances = np.array([body.covariance for body in bodies])
         stack = Superquadric.stack([body.superquadric for body in bodies])
         scene_export.write(
-            scene_export.grown(stack, covariances, options.inflate),
+            scene_export.inflate(stack, covariances, options.inflate),
             path,
             options.export,
             names=[f"body_{k}" for k in shown],

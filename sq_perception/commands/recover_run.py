@@ -1,4 +1,4 @@
-"""One pass of ``sq-perception recover`` over its frames, and its summary."""
+"""The run of ``sq-perception recover`` over its frames, and its summary."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from dataclasses import replace
 from typing import Any
 
 from sq_perception.commands import console
-from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, failed, misused
+from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, fail, reject_usage
 from sq_perception.commands.recover_lines import lines, scene_lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
+from sq_perception.geometry import kernel_cache
 from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
@@ -28,21 +29,20 @@ from sq_perception.recovery.still_scene import StillScene
 
 
 def run(options: argparse.Namespace) -> int:
-    """What ``sq-perception recover`` does with these options; the exit code."""
-    if options.cluster and options.jobs > 1:
-        return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
+    """Run ``sq-perception recover`` with these options; return the exit code."""
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
-        return misused("--json, --jsonl, --csv: only one of them can be the standard output")
+        return reject_usage("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
-        return misused("--poses: expected a pinhole camera, and a method that says how sure it is: auto or symmetry")
+        return reject_usage("--poses: expected a pinhole camera, and a method with deviations: auto or symmetry")
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
+    kernel_cache.compile_beside()
     try:
         this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
-        return failed(str(error))
+        return fail(str(error))
     except ValueError as error:
-        return misused(str(error))
+        return reject_usage(str(error))
     code = this.over_all_frames()
     this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
@@ -57,7 +57,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 class RecoverRun:
-    """One pass, with these options of the command.
+    """One run with these options of the command.
 
     Attributes
     ----------
@@ -100,6 +100,7 @@ class RecoverRun:
                 options.masks,
                 options.ignore_masks,
                 options.depth_kind,
+                options.frame,
             ),
             options.camera_info_topic,
         )
@@ -108,8 +109,8 @@ class RecoverRun:
             raise ValueError(problem)
         if options.method in NEEDS_NETWORK:
             checkpoint.check(options.model)
-        # First: nothing is begun with damaged weights, without the answer of a cluster, or before a Ctrl-C meanwhile.
-        self._executor = self._chosen_executor()
+        # First: nothing is begun with damaged weights, or before a Ctrl-C meanwhile.
+        self._executor = self._make_executor()
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
         poses = CameraPoses(options.poses) if options.poses else None
@@ -118,19 +119,17 @@ class RecoverRun:
         self._unreadable = 0
         self._said: dict[str, set[str]] = {}
 
-    def _chosen_executor(self) -> Recoverer | workers.Processes | workers.Cluster:
+    def _make_executor(self) -> Recoverer | workers.Processes:
         options = self._options
         setup = workers.Setup(options.model, self._settings)
-        if options.cluster:
-            return workers.Cluster(setup, options.cluster)
         if options.jobs > 1:
             return workers.Processes(setup, options.jobs)
         return Recoverer(options.model, method=options.method)
 
     def over_all_frames(self) -> int:
-        """Recover them; the exit code."""
+        """Recover all frames; return the exit code."""
         try:
-            for (file, frame), answer in self._answered(_progress(self._recorded)):
+            for (file, frame), answer in self._answer(_progress(self._recorded)):
                 try:
                     if isinstance(frame, FrameError):
                         raise frame
@@ -152,11 +151,11 @@ class RecoverRun:
         return FAILURE if self._unreadable else console.SUCCESS
 
     def scene(self) -> list[dict[str, Any]]:
-        """The bodies of all frames together, with camera poses."""
+        """Return the bodies of all frames together, with camera poses."""
         return [result_json.scene_entry(track) for track in self._tracks.scene] if self._tracks else []
 
     def summary(self) -> str:
-        """The run in one line."""
+        """Summarise the run in one line."""
         entries = self.outputs.results
         bodies = [body for entry in entries for body in entry["superquadrics"]]
         failed = sum(body["status"] == "failed" for body in bodies)
@@ -173,12 +172,12 @@ class RecoverRun:
         settings = replace(self._settings, free_space=frame.has_free_space)
         return workers.Work(frame.depth, frame.camera, frame.labels, settings)
 
-    def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
-        """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
+    def _answer(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
+        """Yield each frame with its recovery or the error it raised; None for what is no frame."""
         executor = self._executor
-        if isinstance(executor, workers.Processes | workers.Cluster):
+        if isinstance(executor, workers.Processes):
             works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
-            yield from workers.recovered(works, executor)
+            yield from workers.recover_all(works, executor)
             return
         scene = StillScene(executor)
         sequence, is_warm = ("", ""), False
@@ -224,7 +223,7 @@ def _count(number: int, singular: str, many: str | None = None) -> str:
 
 
 def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
-    """The frames, with a bar on a terminal where there are several."""
+    """Yield the frames, with a bar on a terminal if there are several."""
     with console.progress() as bar:
         task = bar.add_task("recovering", total=recorded.total, visible=recorded.total > 1)
         for pair in recorded:

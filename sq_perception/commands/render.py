@@ -1,4 +1,4 @@
-"""``sq-perception render``: one superquadric as a depth image, with the camera that saw it."""
+"""``sq-perception render``: one superquadric as a depth image, with its camera."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from sq_perception.commands.console import (
     SUCCESS,
     at_least,
     complain,
-    failed,
-    misused,
+    fail,
     parser,
+    reject_usage,
     target,
     with_negatives,
 )
@@ -50,7 +50,7 @@ files:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception render``; the exit code."""
+    """Run ``sq-perception render``; return the exit code."""
     command = parser("render", _HELP, _EPILOG)
     add = command.add_argument
     for name in PARAMETERS:
@@ -69,12 +69,12 @@ def _render(options: argparse.Namespace) -> int:
     pinhole = options.projection == "pinhole"
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
-        return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
+        return reject_usage(f"--output: {output.name}: an image of this projection is a {kinds}")
     beside = output.with_suffix(".yaml")
     if pinhole and suffix == ".png" and beside.exists() and not output.exists():
-        return failed(f"{beside}: the camera of {output.name} goes there, but something else has that name")
+        return fail(f"{beside}: the camera of {output.name} goes there, but something else has that name")
     if not pinhole and options.focal is not None:
-        return misused("--focal: of a pinhole camera; see --projection")
+        return reject_usage("--focal: of a pinhole camera; see --projection")
 
     import numpy as np
 
@@ -85,16 +85,16 @@ def _render(options: argparse.Namespace) -> int:
     try:
         given = np.array([getattr(options, name) for name in PARAMETERS])
         if not np.isfinite(given).all():
-            return misused(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
+            return reject_usage(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
         body = Superquadric.from_flat(given)
         seen = body if pinhole else unit_cube.optical_from_cube(body)
         camera = _camera(options)
     except ValueError as error:
-        return misused(str(error))
+        return reject_usage(str(error))
     width, height = camera.width, camera.height
     if width * height > MOST_PIXELS or max(width, height) > _LONGEST:  # nor would any command read it
         expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {_LONGEST}"
-        return misused(f"{expected}, got {width} x {height}")
+        return reject_usage(f"{expected}, got {width} x {height}")
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
         complain("the camera does not see the body: the image is empty")

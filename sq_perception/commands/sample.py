@@ -1,14 +1,14 @@
-"""``sq-perception sample``: a simulated frame to begin with, and what is in it."""
+"""``sq-perception sample``: a simulated frame and its true bodies."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import SUCCESS, misused, parser, target
+from sq_perception.commands.console import SUCCESS, parser, reject_usage, target
 from sq_perception.files import output_file
 
 _HELP = """\
-Write a depth image of four things on a table, as a simulated RealSense D435 measures it, and print their true sizes.
+Write a simulated RealSense D435 depth image of four objects on a table, and print their true sizes.
 The NPZ holds what `sq-perception recover` reads of one: depth (metres, NaN = no reading) and K (3 x 3).
 """
 _EPILOG = """\
@@ -19,12 +19,12 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception sample``; the exit code."""
+    """Run ``sq-perception sample``; return the exit code."""
     command = parser("sample", _HELP, _EPILOG)
     command.add_argument("output", type=target, metavar="FILE", help="an .npz")
     output = command.parse_args(arguments).output
     if output.suffix.lower() != ".npz":
-        return misused(f"{output}: expected a name that ends in .npz")
+        return reject_usage(f"{output}: expected a name that ends in .npz")
 
     import numpy as np
 

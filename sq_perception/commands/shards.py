@@ -9,30 +9,30 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, failed, parser, positive
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, fail, parser, positive
 from sq_perception.learning.training_config import MASK_RUN, THING_RUN, ShardTraining
 
 _DRAW = """\
 Draw {what} into a folder, shard by shard.
 
-Shard k follows from the seed and k alone; those that are there already stay.  Several processes may fill one folder
-with other --first; a training reads what it finds.
+Shard k depends only on the seed and k; existing shards are kept.  Several processes may fill one folder with different
+--first; a training reads what it finds.
 """
 _TRAIN = """\
 Train the network that {what}, on {views} (or still writes).
 
-The same command goes on with a run that was stopped.  The output folder holds the state, a log, and the newest network,
+The same command continues a stopped run.  The output folder holds the state, a log, and the newest network,
 {weights}.
 """
 
 
 def thing_views(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception thing-views``; the exit code."""
+    """Run ``sq-perception thing-views``; return the exit code."""
     example = "sq-perception thing-views sets/things --shards 200 && sq-perception train-things sets/things"
-    command = _drawing("thing-views", "canonical views of simulated household things", example, shards=100)
-    command.add_argument("--views", type=at_least(1), default=512, help="views a shard (512)")
+    command = _drawing("thing-views", "canonical views of simulated household objects", example, shards=100)
+    command.add_argument("--views", type=at_least(1), default=512, help="views per shard (512)")
     command.add_argument(
-        "--meshes", type=Path, metavar="FOLDER", help="your own things, in metres, for half of the views"
+        "--meshes", type=Path, metavar="FOLDER", help="your own objects, in metres, for half of the views"
     )
     given = command.parse_args(arguments)
 
@@ -47,7 +47,7 @@ def thing_views(arguments: Sequence[str]) -> int:
 
 
 def segment_views(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception segment-views``; the exit code."""
+    """Run ``sq-perception segment-views``; return the exit code."""
     example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
     what = "segments of simulated scenes, and which of their readings are of their object,"
     command = _drawing("segment-views", what, example, shards=40)
@@ -60,9 +60,9 @@ def segment_views(arguments: Sequence[str]) -> int:
 
 
 def train_things(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train-things``; the exit code."""
+    """Run ``sq-perception train-things``; return the exit code."""
     text = _TRAIN.format(
-        what="predicts the unseen side of things",
+        what="predicts the unseen side of objects",
         views="views that `thing-views` wrote",
         weights="things.safetensors, which `recover --model` takes",
     )
@@ -75,7 +75,7 @@ def train_things(arguments: Sequence[str]) -> int:
 
 
 def train_masks(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train-masks``; the exit code."""
+    """Run ``sq-perception train-masks``; return the exit code."""
     text = _TRAIN.format(
         what="finds outliers in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
     )
@@ -88,18 +88,18 @@ def train_masks(arguments: Sequence[str]) -> int:
 
 
 def _drawing(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
-    """The parser of both commands that draw, with what they share."""
+    """Make the common parser of both commands that draw."""
     command = parser(name, _DRAW.format(what=what), f"example:\n  {example}")
     add = command.add_argument
     add("folder", type=Path, help="of the shards")
-    add("--shards", type=at_least(1), default=shards, help="how many there shall be (%(default)s)")
+    add("--shards", type=at_least(1), default=shards, help="total number of shards (%(default)s)")
     add("--first", type=at_least(0), default=0, help="number of the first one (0)")
     add("--seed", type=at_least(0), default=0, help="default 0")
     return command
 
 
 def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[Any], Any]]) -> int:
-    """Write the shards with what ``drawing`` gives, which may have to read something first."""
+    """Write the shards that ``drawing`` gives, which may first read something."""
     from sq_perception.geometry.threads import one_kernel_thread
     from sq_perception.learning.shard_training import write_views
 
@@ -107,27 +107,27 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
         with one_kernel_thread():  # a process a core draws
             write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
     except ValueError as error:
-        return failed(f"{name}: {error}")
+        return fail(f"{name}: {error}")
     return SUCCESS
 
 
 def _training(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
-    """The parser of both commands that train, with what they share."""
+    """Make the common parser of both commands that train."""
     command = parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
     add = command.add_argument
     add("views", type=Path, metavar="FOLDER", help="of the shards of views")
     add("--output", "-o", type=Path, default=Path(f"runs/{subject}"), help="folder (%(default)s)")
-    add("--minutes", type=positive, help="training time, over which the rate falls (%(default)s)")
-    add("--batch", type=at_least(1), help="views a step (%(default)s)")
+    add("--minutes", type=positive, help="training time, over which the learning rate falls (%(default)s)")
+    add("--batch", type=at_least(1), help="views per step (%(default)s)")
     add("--rate", type=positive, help="largest learning rate (%(default)s)")
-    add("--threads", type=at_least(0), help="of torch; 0: its own choice")
+    add("--threads", type=at_least(0), help="threads of torch; 0: its own choice")
     add("--device", help="cpu or cuda (%(default)s)")
     add("--validation", type=at_least(1), help="steps between two validations (%(default)s)")
     add("--held", type=at_least(1), help="shards that are kept for validation (%(default)s)")
     add("--seed", type=at_least(0), help="default %(default)s")
     add("--start", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
-    add("--bfloat16", action="store_true", help="half the bits, twice as fast on processors that have them")
+    add("--bfloat16", action="store_true", help="bfloat16 arithmetic, twice as fast on processors that have it")
     return command
 
 
@@ -139,7 +139,7 @@ def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
     try:
         train(subject, replace(run, **options), views, output)
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
-        return failed(f"train-{subject.name}: {error}")
+        return fail(f"train-{subject.name}: {error}")
     except KeyboardInterrupt:
         complain(f"train-{subject.name}: stopped; the same command goes on from the last validation")
         return INTERRUPTED

@@ -1,4 +1,4 @@
-"""``sq-perception train``: run a training, or go on with one."""
+"""``sq-perception train``: run or continue a training."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from sq_perception.commands.console import INTERRUPTED, SUCCESS, failed, parser, progress
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, fail, parser, progress
 from sq_perception.learning import training_config
 from sq_perception.learning.training_config import CHOICES, TrainingConfig
 
 _HELP = """\
-Train the network, with any loss of the thesis.  Options begin with the values of --config, or with the defaults.
+Train the network with any loss of the thesis.  Defaults of the options come from --config if given.
 
-The output folder holds state.safetensors, from which the same command goes on where it stopped, log.jsonl,
+The output folder holds state.safetensors, from which the same command continues, log.jsonl,
 last.safetensors (the newest validated network) and model.safetensors (the best one so far).
 """
 _EPILOG = """\
@@ -26,10 +26,10 @@ examples:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception train``; the exit code."""
+    """Run ``sq-perception train``; return the exit code."""
     command = parser("train", _HELP, _EPILOG)
     command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
-    shipped = ", ".join(training_config.shipped())
+    shipped = ", ".join(training_config.shipped_names())
     command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
     for field in fields(TrainingConfig):
         name = "--" + field.name.replace("_", "-")
@@ -61,5 +61,5 @@ def main(arguments: Sequence[str]) -> int:
         print(stopped, file=sys.stderr)
         return INTERRUPTED
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
-        return failed(f"train: {error}")
+        return fail(f"train: {error}")
     return SUCCESS

@@ -1,6 +1,7 @@
-"""``sq-perception warm-up``: compile every kernel once and keep it on disk, so that no first image has to wait.
+"""``sq-perception warm-up``: compile every kernel and keep it on disk, so that the first image does not wait.
 
-Compiled code is kept beside the modules, or in the user's cache where that folder cannot be written.
+Compiled code is kept beside the modules, or in the user's cache if that folder cannot be written.  ``--only`` names
+the steps that another process runs at the same time: what a first recovery needs beside the fit.
 """
 
 from __future__ import annotations
@@ -11,14 +12,22 @@ from collections.abc import Callable, Sequence
 
 from sq_perception.commands.console import SUCCESS, parser
 
-_HELP = "Compile every kernel once and keep it on disk (about two minutes), so that no first image has to wait."
+_HELP = "Compile every kernel once and keep it on disk (a minute or two), so that the first image does not wait."
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception warm-up``: run every step and print how long each took."""
-    parser("warm-up", _HELP).parse_args(arguments)
+    """Run ``sq-perception warm-up``: run every step and print how long each took."""
+    command = parser("warm-up", _HELP)
+    command.add_argument("--only", nargs="+", metavar="STEP", help="of its steps only these")
+    only = command.parse_args(arguments).only
+    if only is None:
+        from sq_perception.geometry import kernel_cache
+
+        kernel_cache.compile_beside()
     logging.getLogger("sq_perception.geometry.kernel_cache").setLevel(logging.ERROR)  # it says itself how far it is
     for name, action in steps():
+        if only is not None and name not in only:
+            continue
         began = time.perf_counter()
         print(f"preparing {name} ...", end=" ", flush=True)
         action()
@@ -27,7 +36,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
-    """Name and action of everything that compiles."""
+    """Return name and action of each step that compiles."""
     import numpy as np
 
     from sq_perception.fitting import solina_bajcsy, surface_fit
@@ -60,6 +69,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),
         ("segmentation", segments.warm_up),
+        ("network", lambda: Recoverer(method="network").recover(table.render()[0], table.camera)),
         ("still scenes", still_scene.warm_up),
         ("tracking", association.warm_up),
         ("grasps", planner.warm_up),

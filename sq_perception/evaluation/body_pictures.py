@@ -83,7 +83,7 @@ def draw_bodies_3d(
     camera = Camera(side, side, scale, scale, cx, cy, "orthographic")
     depth, index = raycast.render(Superquadric.stack(turned), camera)
     extent = (middle[0] - half, middle[0] + half, middle[1] + half, middle[1] - half)
-    picture = _shaded(depth, index, turned, shades, camera)
+    picture = _shade(depth, index, turned, shades, camera)
     ax.imshow(cv2.resize(picture, (pixels, pixels), interpolation=cv2.INTER_AREA), extent=extent, zorder=2)
     ax.set(xlim=extent[:2], ylim=extent[2:])
     if plane is not None:
@@ -123,7 +123,7 @@ def _upright(plane: np.ndarray | None) -> np.ndarray:
     return np.stack([right, np.cross(up, right), up])
 
 
-def _shaded(
+def _shade(
     depth: np.ndarray, index: np.ndarray, bodies: Sequence[Superquadric], shades: Sequence[np.ndarray], camera: Camera
 ) -> np.ndarray:
     """RGBA float picture (h, w, 4): matt bodies in front of nothing."""
@@ -160,18 +160,18 @@ def _draw_ground(
     step = _round_length(0.35 * half)
     low, high = np.floor(every.min(axis=0) / step - 0.5) * step, np.ceil(every.max(axis=0) / step + 0.5) * step
 
-    def drawn(corners: np.ndarray) -> np.ndarray:
+    def draw(corners: np.ndarray) -> np.ndarray:
         raised = np.concatenate([corners, np.full((*corners.shape[:-1], 1), level)], axis=-1)
         return (raised @ (view @ upright.T).T)[..., :2]
 
     lines = [[(x, low[1]), (x, high[1])] for x in np.arange(low[0], high[0] + 0.5 * step, step)]
     lines += [[(low[0], y), (high[0], y)] for y in np.arange(low[1], high[1] + 0.5 * step, step)]
     frame = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
-    ax.add_patch(Polygon(drawn(frame), closed=True, facecolor="#eef1f4", edgecolor="none", zorder=0))
-    grid = LineCollection(list(drawn(np.array(lines))), colors="#cfd7de", linewidths=0.8, zorder=0.5)
+    ax.add_patch(Polygon(draw(frame), closed=True, facecolor="#eef1f4", edgecolor="none", zorder=0))
+    grid = LineCollection(list(draw(np.array(lines))), colors="#cfd7de", linewidths=0.8, zorder=0.5)
     ax.add_collection(grid, autolim=False)
     for footprint in prints:
-        ax.add_patch(Polygon(drawn(footprint), closed=True, facecolor="#5d6b78", alpha=0.35, lw=0, zorder=1))
+        ax.add_patch(Polygon(draw(footprint), closed=True, facecolor="#5d6b78", alpha=0.35, lw=0, zorder=1))
 
 
 def _round_length(length: float) -> float:

@@ -63,7 +63,7 @@ def distributions(outcome: Outcome) -> Figure:
     return figure
 
 
-def ranked(outcome: Outcome) -> dict[str, list[int]]:
+def rank(outcome: Outcome) -> dict[str, list[int]]:
     """Numbers of the best, median and worst bodies by IoU, best first; no body stands in two of the groups."""
     order = np.argsort(-outcome.figures.iou, kind="stable")
     each = min(_EACH, max(1, len(order) // 3))
@@ -78,7 +78,7 @@ def ranked(outcome: Outcome) -> dict[str, list[int]]:
 
 def examples(outcome: Outcome, images: ThesisImages) -> Figure:
     """Best, median and worst bodies: the image, the prediction rendered from the same place, and both from the side."""
-    groups = ranked(outcome)
+    groups = rank(outcome)
     figure = plots.new_figure(15.0, 6.1)
     rows = figure.add_gridspec(3, _EACH, left=0.045, right=0.995, bottom=0.01, top=0.955, wspace=0.05, hspace=0.14)
     for row, (name, numbers) in enumerate(groups.items()):

@@ -130,7 +130,7 @@ def draw_grasps(
         where, words = camera.project(bodies[k].translation), f"{number}: {reason or 'no grasp'}"
         for grasp in plan.of(k)[:1]:
             for line in hand.wires(grasp.opening):
-                pixels = camera.project(grasp.placed(line))
+                pixels = camera.project(grasp.to_body_frame(line))
                 ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
                 ax.plot(*pixels.T, color=colour(number), lw=2.6, solid_capstyle="round")
                 spots += [pixels - room, pixels + room]

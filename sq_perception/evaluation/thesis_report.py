@@ -51,7 +51,7 @@ def write(
                 "description": contestant.description,
                 "loss": contestant.loss or None,
                 "summary": outcome.figures.summary(),
-                "examples": pictures.ranked(outcome),
+                "examples": pictures.rank(outcome),
                 "pictures": [_file(name, kind) for kind in _CAPTIONS],
                 **contestant.notes,
             }

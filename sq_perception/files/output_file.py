@@ -65,7 +65,7 @@ class OutputFile:
         if not self._through:
             self.partial = self._target.with_name(partial_name or _partial_name(self._target))
             try:
-                self._descriptor = opened(self.partial, os.O_NOFOLLOW)
+                self._descriptor = open_locked(self.partial, os.O_NOFOLLOW)
                 os.ftruncate(self._descriptor, 0)
             except OSError as error:
                 if error.errno not in _NO_NEW_FILES or not self._target.exists():
@@ -99,7 +99,7 @@ class OutputFile:
             old = _status(self._target)
             if not whole and old is not None and stat.S_ISREG(old.st_mode) and old.st_size > 0:
                 return self._beside()
-            if not self._through and self._replaced(old):
+            if not self._through and self._replace_target(old):
                 return self.path
             stream = open_stream(self.path) if is_stream(self.path) else None
             with self.partial.open("rb") as source, open(self.path if stream is None else stream, "wb") as sink:
@@ -129,7 +129,7 @@ class OutputFile:
         self.keep()
         return beside
 
-    def _replaced(self, old: os.stat_result | None) -> bool:
+    def _replace_target(self, old: os.stat_result | None) -> bool:
         """Whether the result has taken the name; not where that cannot be had."""
         if old is not None:
             self.partial.chmod(stat.S_IMODE(old.st_mode))
@@ -150,20 +150,20 @@ class OutputFile:
 @contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
     """Where to write a file that shall appear whole or not at all; raises OSError as :class:`OutputFile` does."""
-    with OutputFile(path) as output, named(path):
+    with OutputFile(path) as output, name_in_errors(path):
         yield output.partial
         output.commit()
 
 
 def write(path: str | Path, data: bytes, whole: bool = True) -> Path:
     """Write a result at once; returns where it is, see :meth:`OutputFile.commit`."""
-    with OutputFile(path) as output, named(path):
+    with OutputFile(path) as output, name_in_errors(path):
         output.partial.write_bytes(data)
         return output.commit(whole)
 
 
 @contextmanager
-def named(path: str | Path) -> Iterator[None]:
+def name_in_errors(path: str | Path) -> Iterator[None]:
     """Within it an OSError that names no file, such as that of a full disk, names this one."""
     try:
         yield
@@ -193,7 +193,7 @@ def free_name(name: str, taken: set[str]) -> str:
     return free
 
 
-def opened(path: Path, flags: int = 0) -> int:
+def open_locked(path: Path, flags: int = 0) -> int:
     """Descriptor of a file, made if need be, that no other caller has open.
 
     Raises

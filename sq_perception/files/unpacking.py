@@ -65,8 +65,10 @@ def npy_array(path: Path) -> np.ndarray:
         raise UnpackingError(f"not a readable NPY file: {error}") from error
 
 
-def grey_image(path: Path) -> np.ndarray:
+def grey_image(path: Path, of_indices: bool = False) -> np.ndarray:
     """A grey PNG, BMP or TIFF (height, width), of any type of number; three equal channels are grey too.
+
+    ``of_indices`` takes a palette's indices in place of its colours: so label images are stored.
 
     Raises
     ------
@@ -82,6 +84,8 @@ def grey_image(path: Path) -> np.ndarray:
     width, height, has_palette = _image_header(encoded)
     if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
         raise UnpackingError(f"not a readable image: expected 1 to {MOST_PIXELS} pixels, got {width} x {height}")
+    if has_palette and of_indices:
+        return _palette_indices(encoded)
     try:
         image = cv2.imdecode(_plain_png(encoded) if encoded[:8].tobytes() == _PNG else encoded, cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
@@ -166,6 +170,16 @@ def _plain_png(encoded: np.ndarray) -> np.ndarray:
             return np.frombuffer(b"".join(kept), np.uint8)
         at = end
     raise UnpackingError("not a readable image: a part of the PNG is missing or damaged")
+
+
+def _palette_indices(encoded: np.ndarray) -> np.ndarray:
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(encoded.tobytes()), formats=("PNG", "BMP", "TIFF")) as image:
+            return np.asarray(image.getchannel("P") if image.mode == "PA" else image)
+    except Exception as error:  # whatever damaged files lead to
+        raise UnpackingError(f"not a readable image: {error}") from error
 
 
 def _image_header(encoded: np.ndarray) -> tuple[int, int, bool]:

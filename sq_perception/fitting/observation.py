@@ -152,7 +152,7 @@ class Crop:
         if not low.any() or 2 * np.count_nonzero(low) > np.count_nonzero(self.mask):
             return inside
         above = coherent(self.depth, self.mask & ~low, jump)
-        with_foot = depth_steps.grown(above.astype(np.int32), low, self.depth, _FOOT_PIXELS, depth_steps.STEP) > 0
+        with_foot = depth_steps.grow(above.astype(np.int32), low, self.depth, _FOOT_PIXELS, depth_steps.STEP) > 0
         is_too_large = np.count_nonzero(with_foot) < (1 - _BEHIND_SHARE) * np.count_nonzero(inside)
         return above if is_too_large else inside
 

@@ -46,7 +46,7 @@ _OPTIONS: dict[str, Any] = {
 
 
 def _elementary(function: _F) -> _F:
-    return kernel_cache.compiled(function, _OPTIONS)
+    return kernel_cache.compile_kernel(function, _OPTIONS)
 
 
 def _bitcast(source: Any, target: Any) -> Any:

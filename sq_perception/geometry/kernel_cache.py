@@ -4,7 +4,8 @@ numba keeps machine code in ``NUMBA_CACHE_DIR``, beside the modules, or in the u
 otherwise refuses to compile at all.  Service users and containers often have none of these.  For them there is a folder
 of the user's own among the temporary files: numba reads machine code with pickle, so that nobody else may write there.
 
-The first kernel that a process has to compile is announced in the log: a first start takes minutes.
+The first kernel that a process has to compile is announced in the log: a first start takes a minute or two.  numba
+compiles on one core; commands and nodes may have others compiled by a second process meanwhile, and find them on disk.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from __future__ import annotations
 import logging
 import os
 import stat
+import subprocess
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import cache
@@ -23,9 +26,23 @@ from numba.core.event import Event, Listener, register
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
+_BESIDE = ("-m", "sq_perception", "warm-up", "--only", "segmentation", "network")
+"""Arguments of Python that compile what a first recovery needs after the fit."""
+_is_shared = False
+_beside: list[subprocess.Popen[bytes]] = []
+"""The process that compiles beside this one, once it was started."""
 
 
-def compiled(function: _F, options: dict[str, Any]) -> _F:
+def compile_beside() -> None:
+    """From now on start a second process as soon as a kernel has to be compiled, if there is a second core.
+
+    It compiles the later kernels of a recovery while this one is at those of the fit.
+    """
+    global _is_shared
+    _is_shared = True
+
+
+def compile_kernel(function: _F, options: dict[str, Any]) -> _F:
     """numba's ``njit`` with these options, its machine code kept wherever there is a place."""
     settings: Any = numba.config
     named = settings.CACHE_DIR
@@ -34,7 +51,7 @@ def compiled(function: _F, options: dict[str, Any]) -> _F:
     except RuntimeError:  # numba knows no place
         kept = None
     if named and (kept is None or not Path(kept.stats.cache_path).is_relative_to(named)):
-        _passed_over(named)
+        _warn_unwritable(named)
     if kept is not None:
         return cast(_F, kept)
     folder = temporary_folder()
@@ -60,11 +77,14 @@ class _Compiling(Listener):
 
 @cache
 def _announce() -> None:
-    _log.warning("compiling, once for this installation: all kernels take about two minutes")
+    _log.warning("compiling, once for this installation: all kernels take a minute or two")
+    if _is_shared and len(os.sched_getaffinity(0)) > 1:
+        quiet = subprocess.DEVNULL
+        _beside.append(subprocess.Popen([sys.executable, *_BESIDE], stdin=quiet, stdout=quiet, stderr=quiet))
 
 
 @cache
-def _passed_over(named: str) -> None:
+def _warn_unwritable(named: str) -> None:
     """Warn once of a NUMBA_CACHE_DIR that cannot be written, as numba does not."""
     _log.warning(
         "NUMBA_CACHE_DIR: %s cannot be written: compiled kernels are kept elsewhere, `sq-perception doctor` says where",

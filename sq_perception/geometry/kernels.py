@@ -79,7 +79,7 @@ def inline_kernel(function: _F) -> _F:
 def _compiled(function: _F, **more: bool) -> _F:
     function.__qualname__ += f"_{_fingerprint(Path(function.__code__.co_filename))}"
     options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", **more}
-    return kernel_cache.compiled(function, options)
+    return kernel_cache.compile_kernel(function, options)
 
 
 @cache
@@ -92,7 +92,7 @@ def _fingerprint(file: Path) -> str:
     """
     known, ahead = {file}, [file]
     while ahead:
-        new = _imported(ahead.pop()) - known
+        new = _find_imports(ahead.pop()) - known
         known |= new
         ahead += new
     digest = hashlib.sha256()
@@ -102,7 +102,7 @@ def _fingerprint(file: Path) -> str:
 
 
 @cache
-def _imported(file: Path) -> set[Path]:
+def _find_imports(file: Path) -> set[Path]:
     """The modules of this package that a source file names in its imports."""
     found = set()
     for package, names in _IMPORT.findall(file.read_text(encoding="utf-8")):
@@ -407,11 +407,11 @@ def ray_interval(origin: Triple, way: Triple, form: Form) -> tuple[bool, float, 
 def _first(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
     if form[5] == 0.0 and form[6] == 0.0:
         return _newton(t_in, t_out, origin, way, form)
-    return _bracketed(t_in, t_out, origin, way, form)
+    return _intersect_tapered(t_in, t_out, origin, way, form)
 
 
 @kernel
-def _bracketed(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
+def _intersect_tapered(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
     """The first intersection of a ray with a tapered body, in even steps from where it enters the frustum."""
     ox, oy, oz = origin
     dx, dy, dz = way

@@ -53,7 +53,7 @@ _SAME_POINT_DIGITS = 12
 
 
 def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:
-    """The closed triangle mesh of one body as arrays.
+    """Return the closed triangle mesh of one body as arrays.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
 
 
 def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
-    """The mesh of :func:`triangles`, which has the parameters, as an object that measures and writes itself."""
+    """Return the mesh of :func:`triangles` as a trimesh object."""
     # Imported where it is needed: a node that starts again and needs only the arrays does not wait for it.
     import trimesh
 
@@ -104,7 +104,7 @@ def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
 
 
 def outline(body: Superquadric, resolution: int = MARKER_RESOLUTION) -> np.ndarray:
-    """Line segments (j, 2, 3) in the parent frame that let the eye read the body: the twelve edges of a box.
+    """Return line segments (j, 2, 3) in the parent frame that show the shape: the twelve edges of a box.
 
     Two rings at eta = +-45 degrees and the four meridians between them.  As e1 and e2 go to zero, these become the
     edges; on a cylinder they are its rims and four lines of its side, on an ellipsoid a cage.  Each edge has about
@@ -194,7 +194,7 @@ def export(
 
 
 def _collada(parts: Sequence[tuple[str, trimesh.Trimesh, np.ndarray]]) -> bytes:
-    """A COLLADA 1.4.1 document, metres, y up, of names, meshes and colours; trimesh writes none by itself."""
+    """Return a COLLADA 1.4.1 document, metres, y up, of names, meshes and colours; trimesh writes none itself."""
     root = ElementTree.Element("COLLADA", xmlns="http://www.collada.org/2005/11/COLLADASchema", version="1.4.1")
 
     def add(parent: ElementTree.Element, tag: str, text: str = "", **attributes: str) -> ElementTree.Element:
@@ -231,7 +231,7 @@ def _collada(parts: Sequence[tuple[str, trimesh.Trimesh, np.ndarray]]) -> bytes:
 
 
 def sample(body: Superquadric, count: int = 1000, seed: int = 0) -> np.ndarray:
-    """Points (count, 3) on the surface of a single body, uniform in area, in its parent frame, metres."""
+    """Return points (count, 3) on the surface of one body, uniform in area, in its parent frame, metres."""
     _check_single(body)
     return body.sample_surface(count, np.random.default_rng(seed))
 

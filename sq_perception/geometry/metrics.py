@@ -17,7 +17,7 @@ from sq_perception.geometry.superquadric import Superquadric
 
 
 def thesis_iou(prediction: Superquadric, truth: Superquadric, resolution: int = 64) -> np.ndarray:
-    """IoU on the thesis' grid: ``resolution``^3 points of the unit cube, ends included; bodies in the cube frame.
+    """Compute IoU on the thesis' grid: ``resolution``^3 points of the unit cube, ends included; cube frame.
 
     What lies outside of the cube does not count, and two bodies that both lie outside have IoU 0.
     """
@@ -26,7 +26,7 @@ def thesis_iou(prediction: Superquadric, truth: Superquadric, resolution: int = 
 
 
 def volume_iou(prediction: Superquadric, truth: Superquadric, resolution: int = 64) -> np.ndarray:
-    """IoU of whole bodies, anywhere: ``resolution``^3 points of the box around both."""
+    """Compute IoU of whole bodies anywhere: ``resolution``^3 points of the box around both."""
     lower, upper = (np.reshape(corner, (-1, 3)) for corner in prediction.bounding_box())
     truth_lower, truth_upper = (np.reshape(corner, (-1, 3)) for corner in truth.bounding_box())
     _batch(prediction, truth)
@@ -34,17 +34,17 @@ def volume_iou(prediction: Superquadric, truth: Superquadric, resolution: int = 
 
 
 def volume_error(prediction: Superquadric, truth: Superquadric) -> np.ndarray:
-    """Delta A of each body: relative error of a1 a2 a3 (equation 5.2 is its mean)."""
+    """Compute Delta A of each body: relative error of a1 a2 a3 (equation 5.2 is its mean)."""
     return np.prod(prediction.size, axis=-1) / np.prod(truth.size, axis=-1) - 1
 
 
 def shape_error(prediction: Superquadric, truth: Superquadric) -> np.ndarray:
-    """Delta E of each body: relative error of e1 + e2 (equation 5.3 is its mean)."""
+    """Compute Delta E of each body: relative error of e1 + e2 (equation 5.3 is its mean)."""
     return np.sum(prediction.shape, axis=-1) / np.sum(truth.shape, axis=-1) - 1
 
 
 def translation_error(prediction: Superquadric, truth: Superquadric) -> np.ndarray:
-    """Delta T of each body (..., 3), in the bodies' unit; the thesis gives its mean in per cent of the cube (5.4)."""
+    """Compute Delta T of each body (..., 3) in its unit; the thesis gives the mean in % of the cube (5.4)."""
     return prediction.translation - truth.translation
 
 
@@ -68,7 +68,7 @@ def _iou(a: Superquadric, b: Superquadric, lower: np.ndarray, upper: np.ndarray,
 
 @kernel
 def _column(body: np.ndarray, m: np.ndarray, x: float, y: float, z0: float, step: float, count: int) -> tuple[int, int]:
-    """First and last grid index inside the body on the column (x, y, z0 + k step)."""
+    """Return first and last grid index inside the body on the column (x, y, z0 + k step)."""
     origin = in_object_frame(m, x - body[5], y - body[6], z0 - body[7])
     form = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
     hit, first, last = ray_interval(origin, (m[2, 0], m[2, 1], m[2, 2]), form)

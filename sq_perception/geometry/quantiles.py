@@ -1,6 +1,6 @@
 """Order statistics of one array: quantiles, a robust standard deviation, and where numbers are densest.
 
-:func:`quantile` and :func:`ranked` give what ``np.quantile`` does.  NumPy spends most of its time on options where
+:func:`quantile` and :func:`select` give what ``np.quantile`` does.  NumPy spends most of its time on options where
 there are few numbers, and on moving them where there are many.
 """
 
@@ -40,7 +40,7 @@ def densest(ordered: np.ndarray, width: float) -> slice:
 
 
 @kernel
-def ranked(numbers: np.ndarray, rank: int) -> float:
+def select(numbers: np.ndarray, rank: int) -> float:
     """The number of float32 (n,) >= 0 that comes after ``rank`` others in rising order.
 
     Their bits, read as whole numbers, have the same order; a count of the upper halves finds the upper half of the

@@ -37,7 +37,7 @@ def multiply(left: Array, right: Array) -> Array:
         w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
         w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
     ]
-    return _joined(product, left, right)
+    return _join(product, left, right)
 
 
 def conjugate(quaternion: Array) -> Array:
@@ -61,7 +61,7 @@ def to_matrix(quaternion: Array) -> Array:
         2 * (y * z + x * w),
         1 - 2 * (x * x + y * y),
     ]
-    return _joined(entries, q).reshape((*q.shape[:-1], 3, 3))
+    return _join(entries, q).reshape((*q.shape[:-1], 3, 3))
 
 
 def from_matrix(matrix: Array) -> Array:
@@ -127,7 +127,7 @@ def cross(left: Array, right: Array) -> Array:
     """Vector product of (..., 3) arrays."""
     a1, a2, a3 = _components(left)
     b1, b2, b3 = _components(right)
-    return _joined([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], left, right)
+    return _join([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], left, right)
 
 
 def random(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -156,7 +156,7 @@ def _components(array: Array) -> Any:
     return array.tolist() if _is_one(array) else [array[..., k] for k in range(array.shape[-1])]
 
 
-def _joined(components: list[Any], *parts: Array) -> Array:
+def _join(components: list[Any], *parts: Array) -> Array:
     """One array of components that were computed from those of ``parts``."""
     if type(components[0]) in (float, int):
         return np.array(components, dtype=np.result_type(*parts))

@@ -1,8 +1,7 @@
-"""What threads of this process may do: BLAS, torch and kernels on one thread, Python's own in short turns.
+"""Limits on the threads of this process: BLAS, torch and kernels on one thread, short turns of Python threads.
 
-The matrices here are small.  Threads of a BLAS spin after products as small as these, on the cores that fits of other
-objects, or other programs, want.  Settings belong to the process; they are taken back when the last block that asks for
-them ends.
+The matrices here are small.  After such small products BLAS threads spin on cores that fits of other objects, or other
+programs, need.  The settings are those of the process; they are restored when the last block that needs them ends.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ def _libraries() -> ThreadpoolController:
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Within the block, and as long as any other such block lasts, BLAS computes on the thread that calls it."""
+    """Compute BLAS on the calling thread within the block, and while any other such block lasts."""
     with _lock:
         _blocks.append(_blocks[0] if _blocks else _libraries().limit(limits=1, user_api="blas"))
     try:
@@ -47,14 +46,14 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def one_torch_thread() -> AbstractContextManager[None]:
-    """Within the block torch computes on the thread that calls it: on busy cores the slowest of many sets the time."""
+    """Compute torch on the calling thread within the block: on busy cores the slowest thread sets the time."""
     import torch
 
     return _one_thread(torch)
 
 
 def one_kernel_thread() -> AbstractContextManager[None]:
-    """Within the block kernels that are parallel compute on the thread that calls them.
+    """Compute parallel kernels on the calling thread within the block.
 
     For many small images beside other work: threads that wait for each other on busy cores take ten times as long.
     """
@@ -75,7 +74,7 @@ def _one_thread(library: Any) -> Iterator[None]:
 
 @contextmanager
 def short_turns() -> Iterator[None]:
-    """Within the block, and as long as any other such block lasts, threads of Python take turns of a millisecond."""
+    """Let Python threads switch every millisecond within the block, and while any other such block lasts."""
     with _lock:
         _turns.append(_turns[0] if _turns else sys.getswitchinterval())
         sys.setswitchinterval(min(TURN, _turns[0]))

@@ -1,7 +1,7 @@
 """Unions of superquadrics, as numbers (k, 14) or, without tapers, (k, 12), compiled: the support of their hull, motion.
 
-The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  Things drawn by the
-thousand for training need it some ten times each; :class:`Superquadric` computes the same for one body at a time.
+The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  Training draws
+thousands of objects and needs it some ten times for each; :class:`Superquadric` computes it for one body at a time.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from sq_perception.geometry.superquadric import Superquadric
 
 
 def support_of_union(parts: Superquadric, directions: np.ndarray) -> np.ndarray:
-    """max n.p over the hull of a batch (k,) of NumPy bodies, for directions n (J, 3), shape (J,)."""
+    """Return max n.p over the hull of a batch (k,) of NumPy bodies, for directions n (J, 3), shape (J,)."""
     return flat_support(np.ascontiguousarray(parts.to_numbers(), dtype=float), np.asarray(directions, dtype=float))
 
 
 @kernel
 def flat_support(flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """The support function (J,) of :func:`support_of_union`, for flat parameters (k, 12 or 14)."""
+    """Return the support function (J,) of :func:`support_of_union`, for flat parameters (k, 12 or 14)."""
     reach = np.full(directions.shape[0], -np.inf)
     for k in range(flat.shape[0]):
         m = _matrix(flat[k, 8:12])
@@ -34,8 +34,8 @@ def flat_support(flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def moved(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Flat parameters (k, 12 or 14) after p -> R p + shift, the rotation given as a unit quaternion (4,)."""
+def move(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return flat parameters (k, 12 or 14) after p -> R p + shift, with the rotation as a unit quaternion (4,)."""
     m = _matrix(rotation)
     out = flat.copy()
     a, b, c, d = rotation
@@ -54,7 +54,7 @@ def moved(flat: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarr
 
 @kernel
 def _matrix(quaternion: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) of a unit quaternion (4,)."""
+    """Return the rotation (3, 3) of a unit quaternion (4,)."""
     x, y, z, w = quaternion
     m = np.empty((3, 3))
     m[0, 0], m[0, 1], m[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)

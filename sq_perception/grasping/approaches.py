@@ -1,10 +1,10 @@
 """Approaches of a parallel gripper to a body, and the places of its pads along them.
 
-A closing is a direction y along which a body is narrow enough and whose opposite surfaces are met squarely.  The hand
-approaches along z, perpendicular to y: as steeply as possible, or swung about y.  With x the cross product of y and z
-the TCP is at
+A closing is a direction y along which a body is narrow enough and whose opposite surfaces the pads meet squarely.  The
+hand approaches along z, perpendicular to y: as steeply as possible, or rotated about y.  With x the cross product of y
+and z the TCP is at
 
-    t + u z + v x,    t the body's centre, u how far ahead of it (deepest, shallow, between), v how far along it.
+    t + u z + v x,    t the body's centre, u the depth (deepest, shallow, between), v the slide along the body.
 
 Metres, in the frame of the bodies.
 """
@@ -37,7 +37,7 @@ _ENGAGED = 0.012
 
 
 class Closings(NamedTuple):
-    """Directions (k, 3) in which a body ``owner`` may be closed upon, reaches (k,), and sigmas (k, 2) of both sides.
+    """Directions (k, 3) along which a body ``owner`` may be gripped, reaches (k,), and sigmas (k, 2) of both sides.
 
     The direction points to the first side.
     """
@@ -49,7 +49,7 @@ class Closings(NamedTuple):
 
 
 class Approaches(NamedTuple):
-    """k closings, each with a direction of approach.
+    """k closings, each with an approach direction.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Approaches(NamedTuple):
 
 
 class Places(NamedTuple):
-    """Where the TCP may be, k of them.
+    """k candidate positions of the TCP.
 
     Attributes
     ----------
@@ -111,8 +111,7 @@ class Places(NamedTuple):
 
 
 def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings:
-    """The closings along which bodies are narrow enough, and at whose middle fingers meet the surface squarely, for a
-    friction mu."""
+    """Find closings along which bodies fit and whose middle fingers meet squarely, for a friction mu."""
     owner = np.repeat(np.arange(len(bodies)), len(DIRECTIONS))
     along = (DIRECTIONS @ bodies.turns.transpose(0, 2, 1)).reshape(-1, 3)
     reach, there = bodies.reaches(owner, along)
@@ -126,7 +125,7 @@ def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings
 def from_every_side(
     bodies: KnownBodies, found: Closings, gripper: Gripper, around: Surroundings, placement: float
 ) -> Approaches:
-    """Every closing from every side except from below; ``placement`` is the standard deviation of the hand, metres."""
+    """Approach every closing from every side except below; ``placement`` is the hand's sigma, metres."""
     y = np.repeat(found.along, len(_SWINGS), axis=0)
     owner = np.repeat(found.owner, len(_SWINGS))
     half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (found.reach, found.sigma))
@@ -159,7 +158,7 @@ def from_every_side(
 
 
 def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: float) -> Places:
-    """The places of each approach, in all depths and slides, at which the pads meet the body squarely.
+    """Find the places of each approach, at all depths and slides, where the pads meet the body squarely.
 
     A body without any such place has all of its places.  ``steepest`` is the angle to the normals up to which a pad may
     hold, radians.
@@ -190,7 +189,7 @@ def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: f
 
 @kernel
 def _offsets(frames: np.ndarray, at: np.ndarray, aside: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Offsets (k, 3) along the first and the third axis of frames ``at`` (k,)."""
+    """Return offsets (k, 3) along the first and third axis of frames ``at`` (k,)."""
     offset = np.empty((len(at), 3))
     for k in range(len(at)):
         for i in range(3):

@@ -1,13 +1,13 @@
-"""How far a gripper stays from everything: other bodies, the table, measured points.
+"""Clearance of a gripper from other bodies, the table and measured points.
 
-Two convex sets are apart by at least the gap along any direction n,
+The distance of two convex sets is at least the gap along any direction n,
 
     gap(n) = n.(c_body - c_box) - h_body(-n) - h_box(n),
 
 with the support functions h of body and box in closed form.  The greatest gap over some directions is a lower bound of
-their distance: towards the body's centre from the box's nearest point, and along the axes of both.  It is negative
-where none of them parts the two: a collision, or at worst a near miss that is taken for one.  Likewise the distance of
-a point inside a box is negative: by how much it would have to move to leave it.
+the distance: towards the body's centre from the box's nearest point, and along the axes of both.  It is negative if no
+direction separates them: a collision, or at worst a near miss.  Likewise the distance of a point inside a box is
+negative: how far it would have to move to leave it.
 
 Boxes are those of :meth:`Gripper.boxes`.  Metres.
 """
@@ -32,7 +32,7 @@ _STRAY = 3
 def gaps_to_bodies(
     frames: np.ndarray, boxes: np.ndarray, owner: np.ndarray, flat: np.ndarray, turns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least gap (k,) of each gripper to all bodies but its own, which body that is, -1 for none within reach, and n.
+    """Return each gripper's least gap (k,) to other bodies, that body's index (-1: none within reach), and n.
 
     The unit vector n (k, 3) points to the body, in the frame of the bodies; 0 for none.
 
@@ -90,7 +90,7 @@ def _gap(
     enough: float,
     way: np.ndarray,
 ) -> float:
-    """The gap of a box to a body whose centre and axes are given in the box's frame, along ``way`` (3,), written there.
+    """Return the gap of a box to a body, in the box's frame, along ``way`` (3,).
 
     Any gap that is ``enough`` will do.
     """
@@ -133,7 +133,7 @@ def _gap(
 
 @inline_kernel
 def _reach(m: np.ndarray, body: np.ndarray) -> float:
-    """The support function of a body (14,) along m (3,) in its own frame, or against it if that is more."""
+    """Return the support function of a body (14,) along m (3,) in its own frame, or along -m if that is more."""
     a1, a2, a3, e1, e2, k1, k2 = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
     ahead = support(m[0], m[1], m[2], a1, a2, a3, e1, e2, k1, k2)
     if k1 == 0.0 and k2 == 0.0:
@@ -143,13 +143,13 @@ def _reach(m: np.ndarray, body: np.ndarray) -> float:
 
 @inline_kernel
 def _half(body: np.ndarray) -> tuple[float, float, float]:
-    """Half sizes of the box around a body (14,) along its own axes."""
+    """Return the half sizes of the box around a body (14,) along its axes."""
     return body[0] * (1.0 + abs(body[12])), body[1] * (1.0 + abs(body[13])), body[2]
 
 
 @inline_kernel
 def _distance(place: np.ndarray, box: np.ndarray) -> float:
-    """The distance of a place (3,) to a box (6,) in the same frame; negative inside."""
+    """Return the distance of a place (3,) to a box (6,) in the same frame; negative inside."""
     square, deep = 0.0, -np.inf
     for i in range(3):
         beyond = abs(place[i] - box[i]) - box[3 + i]
@@ -159,7 +159,7 @@ def _distance(place: np.ndarray, box: np.ndarray) -> float:
 
 
 def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance (k,) of each gripper to the points (j, 3), but for the few nearest; negative where they are inside."""
+    """Return each gripper's distance (k,) to the points (j, 3), but for the few nearest; negative inside."""
     cell = np.floor(points / _CELL)
     key = cell @ [1.0, 1e4, 1e8]
     order = np.argsort(key)
@@ -172,7 +172,7 @@ def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) ->
 def _gaps_to_cells(
     frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray
 ) -> np.ndarray:
-    """As :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.
+    """Do as :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.
 
     Cells that are out of reach are passed over.
     """
@@ -200,7 +200,7 @@ def _gaps_to_cells(
 
 @inline_kernel
 def _distances(frame: np.ndarray, boxes: np.ndarray, places: np.ndarray, least: np.ndarray) -> None:
-    """Write the distance of places (3, j) to the nearest of some boxes (m, 6) of a gripper's frame to ``least``.
+    """Write the distances of places (3, j) to the nearest box (m, 6) of a gripper's frame to ``least``.
 
     One loop over all places for each box, without a branch, so that it becomes vector code.
     """
@@ -229,7 +229,7 @@ def _into(frame: np.ndarray, place: np.ndarray, at: np.ndarray) -> None:
 
 @kernel
 def heights_above(plane: np.ndarray, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-    """Height (k,) of the lowest corner of each gripper's boxes above a plane n.p + d = 0."""
+    """Return the height (k,) of the lowest corner of each gripper's boxes above a plane n.p + d = 0."""
     height = np.full(len(frames), np.inf)
     up = np.empty(3)
     for k in range(len(frames)):

@@ -1,17 +1,17 @@
-"""Where two flat jaws may close on a superquadric: widths, contacts and how sure they are, in closed form.
+"""Closing two flat jaws on a superquadric: widths, contacts and their uncertainty, in closed form.
 
 A body with the support function h and the centre t spans along a unit direction n from n.t - h(n) to n.t + h(n): the
-opening for jaws that close along n is 2 h(n).  A superquadric is centrally symmetric, so that the chord through c + t
-along n leaves it at two points; both lie in the friction cone of jaws that close along n where the normals there are
-no farther than atan(mu) from +-n.  Along the axes this is so exactly, and on a round body in the whole circle around
-its axis.  Tried are the axes and twelve directions in each plane of two axes.
+opening for jaws that close along n is 2 h(n).  A superquadric is centrally symmetric, so the chord through c + t
+along n leaves it at two points; both lie in the friction cone of the jaws if the normals there are within atan(mu)
+of +-n.  Along the axes this holds exactly, and for a round body in the whole circle around its axis.  The candidates
+are the axes and twelve directions in each plane of two axes.
 
-How sure a reach E(n) = n.t + h(n) is follows from the covariance C of the body to first order,
+The variance of a reach E(n) = n.t + h(n) follows from the covariance C of the body to first order,
 
     sigma^2 = g^T C g,   g = dE / d(a1 a2 a3, t, w) = (|m| dh/d(a |m|), n, p x m),
 
 with m = R^T n, p the body's point farthest along m and w the turn in the body's frame.  Along the axes E does not
-depend on the exponents; beside them the little that it does is left out.
+depend on the exponents; in other directions that small effect is neglected.
 
 Metres, in the frame of the bodies.
 """
@@ -38,7 +38,7 @@ _KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
 
 
 def _directions() -> np.ndarray:
-    """(33, 3) closing directions in the frame of a body, one of each opposite pair."""
+    """Return (33, 3) closing directions in a body's frame, one of each opposite pair."""
     found = [np.eye(3)]
     for first, second in ((0, 1), (0, 2), (1, 2)):
         angle = np.delete(np.arange(12), 6)[1:] * _STEP
@@ -51,7 +51,7 @@ DIRECTIONS = _directions()
 
 @dataclass(frozen=True, eq=False)
 class KnownBodies:
-    """Bodies as far as they are known, n of them.
+    """n bodies with their uncertainty.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class KnownBodies:
 
     @classmethod
     def of(cls, bodies: Superquadric, covariance: np.ndarray | None) -> KnownBodies:
-        """A NumPy batch (n,) and covariances (n, 11, 11); of numbers whose variance is unknown a wide guess is taken.
+        """Make them from a NumPy batch (n,) and covariances (n, 11, 11); an unknown variance becomes a wide guess.
 
         Raises
         ------
@@ -102,17 +102,17 @@ class KnownBodies:
         return self.flat[:, 5:8]
 
     def in_place(self) -> KnownBodies:
-        """The bodies with centres that are known for sure."""
+        """Return the bodies with centres that are known exactly."""
         covariance = self.covariance.copy()
         covariance[:, 3:6] = covariance[:, :, 3:6] = 0.0
         return replace(self, covariance=covariance)
 
     def reaches(self, owner: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """h(n) (k,) and the standard deviation (k,) of n.t + h(n), for bodies ``owner`` (k,) and directions (k, 3)."""
+        """Return h(n) (k,) and the sigma (k,) of n.t + h(n), for bodies ``owner`` (k,) and directions (k, 3)."""
         return _reaches(self.flat, self.turns, self.covariance, owner, directions)
 
     def middle_angles(self, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Angle (k,) between directions (k, 3) and the normals where the lines through the centre along them leave.
+        """Return the angle (k,) between directions (k, 3) and the normals where central lines along them leave.
 
         The gradient of the gauge is the same all along such a line, but for tapers, which are left out of account.
         """
@@ -125,7 +125,7 @@ class KnownBodies:
     def chords(
         self, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray, steepest: float = np.pi
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
+        """Find where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
 
         Returns
         -------
@@ -179,7 +179,7 @@ def _reaches(
 def _chords(
     body: np.ndarray, turn: np.ndarray, offset: np.ndarray, direction: np.ndarray, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Ends and cosines (2, k) of chords of one body; at the second end of those alone whose first cosine is enough."""
+    """Return ends and cosines (2, k) of one body's chords; second ends only where the first cosine is large enough."""
     at, way = np.empty((3, len(offset))), np.empty((3, len(offset)))
     for k in range(len(offset)):
         for i in range(3):
@@ -196,7 +196,7 @@ def _chords(
 
 @kernel
 def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, cosine: np.ndarray) -> None:
-    """Where lines from at (3, k) along way (3, k), in a body's own frame, leave it, and the cosine to the normal there.
+    """Return where lines from at (3, k) along way (3, k) leave a body, in its frame, and the cosine to the normal.
 
     They start where they leave the box around the body: g is convex along them, and Newton's steps from outside stay
     outside, or come near to the surface from inside where a body tapers.  A step is one loop over all lines that has no

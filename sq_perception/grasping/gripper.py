@@ -1,14 +1,14 @@
-"""Parallel grippers as boxes, and where their tool centre point is.
+"""Parallel grippers as boxes, and their tool centre points.
 
 The frame of a grasp is that of the tool centre point, TCP, midway between the pads:
 
-    z   the way of the approach, out of the palm
-    y   the way of the fingers: they close along y, towards each other
+    z   approach direction, out of the palm
+    y   closing direction of the fingers
     x   along the width of a finger
 
 The fingers are boxes |x| <= finger_width / 2, opening / 2 <= |y| <= opening / 2 + finger_thickness, -palm <= z <= tip;
-the hand is a box behind them, z <= -palm, and so long and wide that it holds the way of the approach as well, its own
-and that of the fingers.  Metres, newtons.
+the hand is a box behind them, z <= -palm, long and wide enough to cover the approach path of hand and fingers as well.
+Metres, newtons.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _are_numbers(value: object, shape: tuple[int, ...]) -> bool:
 
 @dataclass(frozen=True)
 class Gripper:
-    """One parallel gripper.
+    """A parallel gripper.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class Gripper:
             raise ValueError(f"link_from_tcp: expected a position and a quaternion, got {self.link_from_tcp}")
 
     def boxes(self, opening: float, reach: float = _REACH) -> np.ndarray:
-        """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.
+        """Return centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.
 
         The hand is longer by ``reach``, by which it sweeps the way that it comes, and as wide as the open fingers,
         which come that way before it.
@@ -107,12 +107,12 @@ class Gripper:
         )
 
     def boxes_at(self, openings: np.ndarray) -> np.ndarray:
-        """:meth:`boxes` (k, 3, 6) at many openings (k,)."""
+        """Return :meth:`boxes` (k, 3, 6) at many openings (k,)."""
         closed = self.boxes(0.0)
         return np.asarray(closed + openings[:, None, None] * (self.boxes(1.0) - closed))
 
     def faces_at(self, openings: np.ndarray) -> np.ndarray:
-        """Places (k, 3, 9, 3) in the TCP's frame that a body must not reach, at many openings (k,).
+        """Return places (k, 3, 9, 3) in the TCP's frame that a body must not reach, at many openings (k,).
 
         On the pads of both fingers, from their middle to their end, and on the palm between them.
         """
@@ -126,7 +126,7 @@ class Gripper:
         return places
 
     def mesh(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Vertices (24, 3), faces (36, 3) and edges (36, 2, 3) of fingers and hand in the TCP's frame."""
+        """Return vertices (24, 3), faces (36, 3) and edges (36, 2, 3) of fingers and hand in the TCP's frame."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         vertices = np.concatenate([box[:3] + signs * box[3:] for box in self.boxes(opening, reach=0.0)])
         faces = np.concatenate([_BOX_FACES + 8 * k for k in range(3)])
@@ -135,7 +135,7 @@ class Gripper:
         return vertices, faces, vertices[edges]
 
     def wires(self, opening: float) -> list[np.ndarray]:
-        """Lines (j, 3) in the TCP's frame that draw the gripper: the fork of its fingers, and its wrist."""
+        """Return lines (j, 3) in the TCP's frame that draw the gripper: the fork of its fingers and its wrist."""
         fork = np.array([[0, 0.5, self.tip], [0, 0.5, -self.palm], [0, -0.5, -self.palm], [0, -0.5, self.tip]])
         wrist = np.array([[0.0, 0.0, -self.palm], [0.0, 0.0, -self.palm - self.hand[2]]])
         return [fork * [1.0, opening, 1.0], wrist]
@@ -195,7 +195,7 @@ GRIPPERS: Mapping[str, Gripper] = MappingProxyType(
 
 
 def gripper(name: str) -> Gripper:
-    """The preset of this name.
+    """Return the preset of this name.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a plan of grasps is made of.
+"""Grasps and plans of grasps.
 
 The pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame of the bodies; metres.
 """
@@ -14,7 +14,7 @@ from sq_perception.geometry import rotation as quaternions
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """One grasp.
+    """A grasp.
 
     Attributes
     ----------
@@ -40,8 +40,8 @@ class Grasp:
     score: float
     weakest: str
 
-    def placed(self, points: np.ndarray) -> np.ndarray:
-        """Points (j, 3) of the TCP's frame in the frame of the bodies."""
+    def to_body_frame(self, points: np.ndarray) -> np.ndarray:
+        """Transform points (j, 3) from the TCP's frame to the frame of the bodies."""
         return points @ np.asarray(quaternions.to_matrix(self.rotation)).T + self.position
 
 
@@ -61,5 +61,5 @@ class GraspPlan:
     reasons: tuple[str, ...] = ()
 
     def of(self, body: int) -> tuple[Grasp, ...]:
-        """The grasps of one body, best first."""
+        """Return the grasps of one body, best first."""
         return tuple(grasp for grasp in self.grasps if grasp.body == body)

@@ -2,7 +2,7 @@
 
     P = product over k of Phi(m_k / sigma_k)
 
-Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it is:
+Every margin m_k is a distance or angle to failure, sigma_k its standard deviation:
 
 | margin | of what | sigma |
 | --- | --- | --- |
@@ -12,18 +12,17 @@ Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it
 | friction | the cone's half angle less that between pads and surface | of mu, of the surface's turn |
 | weight | friction of both pads against gravity, as a force and as a torque about the closing line | of the mass |
 | table, bodies, points | the gripper's least distance | of the obstacle where it is nearest, the hand |
-| unseen | share of the fingers in space that nobody has seen | a share of it is taken |
+| unseen | share of the fingers in unobserved space | a share of it is taken as occupied |
 
-Vessels that none of these is sure of are also tried by their rims (:mod:`sq_perception.grasping.rims`).
+Vessels without a safe grasp are also tried by their rims (:mod:`sq_perception.grasping.rims`).
 
-The opening is the body's width and, on either side, a clearance and twice the sigma of that side; less where the
-gripper opens no wider.  The hand stands farther from the side that is less sure.  A side that was not seen is
-uncertain, so that a body of unknown depth is taken by its known sides.  The hand comes to be where it is sent to but
-for the error of its calibration.  How far real things stray from superquadrics is in the covariance of a fit already.
-Where the image shows that the place of a pad, or of the palm between the fingers, is empty, there is no body: its sides
-and its near end count by the share of that place which is hidden, and the distance of measured points tells the rest.
-Margins are taken as independent of each other, except that of measured points: these are points of the bodies, so that
-only what it takes beyond opening, palm and other bodies counts.
+The opening is the body's width plus, on either side, a clearance and twice the sigma of that side, limited by the
+gripper.  The hand keeps farther from the less certain side.  Unseen sides are uncertain, so a body of unknown depth is
+gripped by its known sides.  The hand's error is that of its calibration.  The covariance of a fit already contains how
+far real objects deviate from superquadrics.  Where the image shows that the place of a pad, or of the palm between
+the fingers, is empty, there is no body: sides and near end count by the hidden share of that place, and the distance
+of measured points covers the rest.  Margins are treated as independent, except that of measured points: these belong
+to the bodies, so only what it adds to opening, palm and other bodies counts.
 
 Metres, newtons, kilograms; the pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame
 of the bodies.
@@ -87,7 +86,7 @@ def grasps(
     friction: float = FRICTION,
     placement: float = PLACEMENT,
 ) -> GraspPlan:
-    """Plan grasps of some bodies; those that have none come with the reason.
+    """Plan grasps of some bodies, with the reason for those that have none.
 
     Parameters
     ----------
@@ -138,7 +137,7 @@ def grasps(
 
 
 def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
-    """Which bodies (n,) lie wholly behind the plane."""
+    """Return which bodies (n,) lie wholly behind the plane."""
     if plane is None:
         return np.zeros(len(bodies), dtype=bool)
     top, _ = bodies.reaches(np.arange(len(bodies)), np.tile(plane[:3], (len(bodies), 1)))
@@ -146,7 +145,7 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
 
 
 def _probable(trials: Trials, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """The ``count`` best of each body that has any; the weakest margin of the best one is the reason of the others."""
+    """Return each body's ``count`` best grasps; for the others, the best one's weakest margin as the reason."""
     found = trials.first(count, np.log(_LEAST))
     without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
@@ -171,7 +170,7 @@ def _trials(
     friction: float,
     placement: float,
 ) -> Trials:
-    """Every closing from every side, at every depth and slide, with the margins that the body alone decides."""
+    """Return every closing from every side, at every depth and slide, with the margins of the body alone."""
     narrow, broad = np.arctan([friction, _AT_MOST * friction])
     cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
     every = approaches.from_every_side(bodies, found, gripper, around, placement)
@@ -199,7 +198,7 @@ def _trials(
 
 
 def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:
-    """The trials with better margins where fingers end above the middle and so above where a body is widest."""
+    """Return the trials with better margins where fingers end above the middle, so above the widest section."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
     beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
     rows = np.flatnonzero((beside * z).sum(axis=1) < 0)
@@ -222,7 +221,7 @@ def _among_others(
     around: Surroundings,
     placement: float,
 ) -> Trials:
-    """The best trials with the margins that the surroundings decide."""
+    """Return the best trials with the margins of the surroundings."""
     if not len(trials.owner):
         return trials
     boxes = gripper.boxes_at(trials.opening)
@@ -242,16 +241,16 @@ def _among_others(
 
 
 def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
-    """Count sides and near ends only as far as the image does not show that they are empty; points tell the rest."""
+    """Weight sides and near ends by the share that the image does not show to be empty; points tell the rest."""
     turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
-    hidden = around.hidden(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
+    hidden = around.hidden_share(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
     shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(log_phi(gap + PASSES, np.hypot(SIDE_SIGMA, placement)))
     trials.logs[:, 0] = np.log1p(hidden[:, :2] * np.expm1(trials.sides)).sum(axis=1) + np.log1p(shown)
     trials.logs[:, 2] = np.log1p(hidden[:, 2] * np.expm1(trials.logs[:, 2]))
 
 
 def _as_grasps(trials: Trials) -> Iterator[Grasp]:
-    """All trials as grasps, the most probable first."""
+    """Convert all trials to grasps, the most probable first."""
     total = trials.total
     order = np.argsort(-total, kind="stable")
     turns = quaternions.from_matrix(trials.frames[:, :, :3])

@@ -1,11 +1,11 @@
 """Grasps of open vessels by their rim: one finger inside, one outside, down along their upright axis.
 
-Bodies are convex and know of no cavity, measured points do.  At a bearing around a body the rim is what was measured
-within some millimetres of the highest points there, if that is as thin as a wall.  There is a cavity behind it if the
-image shows something farther away than the places where the end of the inner finger comes to be.
+Bodies are convex and have no cavity, so rims come from measured points.  At a bearing around a body the rim consists of
+the points within some millimetres of the highest ones, if they are as thin as a wall.  There is a cavity behind it if
+the image shows something beyond the place of the inner finger's end.
 
-The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh a share of what a
-full body would; the pads hold their torque about the tangent by as much as they overlap.
+The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh a share of a full
+body; the pads resist torque about the tangent by their overlap.
 
 Metres, in the frame of the bodies.
 """
@@ -52,7 +52,7 @@ _WALLS = 0.3
 def at_rims(
     bodies: Superquadric, which: np.ndarray, gripper: Gripper, around: Surroundings, friction: float, placement: float
 ) -> Trials:
-    """Grasps of bodies ``which`` by their rims, with all margins but those that the surroundings decide."""
+    """Find grasps of bodies ``which`` by their rims, with all margins but those of the surroundings."""
     found = [] if around.plane is None else [rim for k in which for rim in _rims(bodies[k], int(k), gripper, around)]
     owner = np.array([rim[0] for rim in found], dtype=int).repeat(len(_INSETS))
     inset = np.tile(_INSETS, len(found))
@@ -82,7 +82,7 @@ def at_rims(
 def _rims(
     body: Superquadric, owner: int, gripper: Gripper, around: Surroundings
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """Owner, frame (3, 4) on the rim, y outwards, and thickness of the wall of each bearing that has one."""
+    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim."""
     assert around.plane is not None
     upwards = around.plane[:3] @ body.rotation_matrix
     axis = int(np.argmax(np.abs(upwards)))
@@ -105,7 +105,7 @@ def _rims(
 
 
 def _is_open(trials: Trials, fingers: np.ndarray, around: Surroundings) -> np.ndarray:
-    """Whether the image shows something beyond most of the end of each finger (k, 6)."""
+    """Return whether the image shows something beyond most of the end of each finger (k, 6)."""
     grid = np.array([[x, y, 1.0] for x in (-0.8, 0.0, 0.8) for y in (-0.8, 0.0, 0.8)])
     local = fingers[:, None, :3] + grid * fingers[:, None, 3:]
     ends = local @ trials.frames[:, :, :3].transpose(0, 2, 1) + trials.frames[:, None, :, 3]

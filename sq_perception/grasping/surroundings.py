@@ -1,4 +1,4 @@
-"""What surrounds the bodies: the table, other measured points, and space that was not seen."""
+"""The surroundings of the bodies: the table, other measured points, and unseen space."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _ABOVE = 0.008
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """All that a gripper has to avoid beside the bodies, in their frame.
+    """All that a gripper must avoid beside the bodies, in their frame.
 
     Attributes
     ----------
     plane : (4,), optional
         What the bodies stand on: the height above it is n.p + d, n up and of length 1.
     points : (j, 3)
-        Measured points of things; the table's are not among them.
+        Measured points of objects; the table's are not among them.
     depth, camera
         A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical
         one: what lies behind what it shows has not been seen.
@@ -69,7 +69,7 @@ class Surroundings:
 
     @classmethod
     def of_image(cls, depth: np.ndarray, camera: Camera, plane: np.ndarray | None) -> Surroundings:
-        """What a depth image shows: its plane, all points above it, thinned out, and what it hides.
+        """Extract from a depth image its plane, a thinned set of the points above it, and what it hides.
 
         Parameters
         ----------
@@ -94,25 +94,25 @@ class Surroundings:
         return cls(plane, points[kept], hole_filling.filled(z)[0], camera)
 
     def down(self, places: np.ndarray) -> np.ndarray:
-        """Unit vectors (k, 3) downwards at places (k, 3): onto the plane, without one away from the frame's origin."""
+        """Return unit vectors (k, 3) downwards at places (k, 3): to the plane, or away from the frame's origin."""
         if self.plane is not None:
             return np.broadcast_to(-self.plane[:3], places.shape)
         length = np.linalg.norm(places, axis=1, keepdims=True)
         return np.where(length > 1e-6, places / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
 
     def unseen(self, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        """Share (k,) of some boxes (k, m, 6) at frames (k, 3, 4) that lies behind what the image shows."""
+        """Return the share (k,) of some boxes (k, m, 6) at frames (k, 3, 4) that is behind what the image shows."""
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
         local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
         return np.asarray(np.mean(self.beyond(places) < -_BEHIND, axis=1))
 
-    def hidden(self, places: np.ndarray) -> np.ndarray:
-        """Share (...,) of places (..., j, 3) of which the image does not show that they are empty."""
+    def hidden_share(self, places: np.ndarray) -> np.ndarray:
+        """Return the share (...,) of places (..., j, 3) that the image does not show to be empty."""
         return np.asarray(np.mean(~(self.beyond(places) > _EMPTY), axis=-1))
 
     def beyond(self, places: np.ndarray) -> np.ndarray:
-        """How much farther away than places (..., 3) the reading at their pixel is, metres; NaN for no reading."""
+        """Return how far the reading at the pixel of places (..., 3) is behind them, metres; NaN for no reading."""
         if self.depth is None or self.camera is None:
             return np.full(places.shape[:-1], np.nan)
         camera, flat = self.camera, np.ascontiguousarray(places, dtype=float).reshape(-1, 3)
@@ -123,7 +123,7 @@ class Surroundings:
 
 @kernel
 def _pixels_at(places: np.ndarray, width: int, height: int, lens: Lens) -> np.ndarray:
-    """Position (k,) in a flat image of the pixels that show places (k, 3); -1 beyond the image or not before it."""
+    """Return the flat index (k,) of the pixels that show places (k, 3); -1 outside the image or behind the camera."""
     found = np.full(len(places), -1)
     for k in range(len(places)):
         z = places[k, 2]

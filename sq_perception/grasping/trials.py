@@ -1,4 +1,4 @@
-"""Candidate grasps: the probabilities of their margins, and what all ways of grasping have in common.
+"""Candidate grasps: the probabilities of their margins, and common functions of all kinds of grasps.
 
 Metres, newtons, kilograms.
 """
@@ -10,18 +10,18 @@ from typing import NamedTuple
 import numpy as np
 
 DENSITY = 500.0
-"""Density of things, kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
+"""Density of objects, kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 CLEARANCE = 0.005
 """Clearance on either side of the body and before the palm, metres."""
 LEAST_ENGAGED = 0.004
 """Least length of finger beyond the near end, metres."""
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
-"""Standard deviation, metres, to which thinned points tell where a thing's side is that the image shows a finger to
+"""Standard deviation, metres, to which thinned points tell where an object's side is that the image shows a finger to
 pass: of 247 such sides, 3.3 mm with the 2 mm of the hand (30 scenes of benchmarks/picking.py from seed 30010 on)."""
 PASSES = 0.001
-"""Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
-(60 household things in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
+"""Metres by which a finger may come down on the edge of an object: half of those that did passed it and pushed it aside
+(60 household objects in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
 NEARER = 0.4
 """Sigmas by which sides are nearer than fits say, of 797 tried ones that were known to more than 3.5 mm: medians of 0.3
 to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where
@@ -54,16 +54,16 @@ class Trials(NamedTuple):
 
     @property
     def total(self) -> np.ndarray:
-        """Logarithm (k,) of the probability that all margins are kept."""
+        """Return the logarithm (k,) of the probability that all margins hold."""
         return np.asarray(np.einsum("ij->i", self.logs))
 
     @property
     def weakest(self) -> np.ndarray:
-        """Index (k,) of the margin that takes most from each trial."""
+        """Return the index (k,) of the least probable margin of each trial."""
         return np.asarray(np.argmin(self.logs, axis=1))
 
     def first(self, count: int, least: float = -np.inf) -> Trials:
-        """The most probable ones of each body, each body's in order, without those below the logarithm ``least``."""
+        """Return the most probable trials of each body in order, without those below the logarithm ``least``."""
         total = self.total
         rows = np.flatnonzero(total >= least)  # also what cannot hold, -inf: why it does not is a reason
         rows = rows[np.lexsort((-total[rows], self.owner[rows]))]
@@ -73,19 +73,19 @@ class Trials(NamedTuple):
 
 
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
-    """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
+    """Return log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
     return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
 
 
 def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
-    """log Phi(m / sigma), never below log(1e-12); nothing is known to less than a micrometre."""
+    """Return log Phi(m / sigma), at least log(1e-12); sigma is at least a micrometre."""
     from scipy.special import ndtr  # here: a node that recovers does without
 
     return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
 
 
 def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = _PAD_RADIUS) -> np.ndarray:
-    """log P (k,) that a friction of both pads of ``force`` lifts a mass, ``lever`` beside the closing line.
+    """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line.
 
     As a force, and as a torque that the friction holds by its mean ``arm``.
     """

@@ -113,7 +113,7 @@ class Calibration:
         sent = self.camera if self.rectification is None else self.rectification.raw
         return sent.width, sent.height
 
-    def rectified(self, depth: np.ndarray) -> np.ndarray:
+    def rectify(self, depth: np.ndarray) -> np.ndarray:
         """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.
 
         Raises
@@ -124,7 +124,7 @@ class Calibration:
         self.check(depth)
         return depth if self.rectification is None else self.rectification.there.depth(depth)
 
-    def rectified_labels(self, labels: np.ndarray) -> np.ndarray:
+    def rectify_labels(self, labels: np.ndarray) -> np.ndarray:
         """The label image of ``camera`` from one of the depth image as it was sent; raises as :meth:`rectified`."""
         self.check(labels)
         return labels if self.rectification is None else self.rectification.there.labels(labels)

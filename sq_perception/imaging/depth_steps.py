@@ -31,14 +31,14 @@ def components(mask: np.ndarray) -> np.ndarray:
     return labels
 
 
-def separated(depth: np.ndarray, wanted: np.ndarray, step: float = STEP) -> np.ndarray:
+def separate(depth: np.ndarray, wanted: np.ndarray, step: float = STEP) -> np.ndarray:
     """Components of the wanted pixels, cut where neighbouring depths jump; the cut pixels are given back."""
     filled = np.where(wanted, depth, np.float32(0))
     labels = components(wanted & ~edges(filled, wanted, step))
-    return grown(labels, wanted & (labels == 0), depth, 2, step)
+    return grow(labels, wanted & (labels == 0), depth, 2, step)
 
 
-def grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: float) -> np.ndarray:
+def grow(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: float) -> np.ndarray:
     """Let labels grow into free pixels, by a pixel per round and not across a depth step."""
     grown = np.array(labels, dtype=np.int32, order="C")
     _grow(grown, np.flatnonzero(free), np.ascontiguousarray(depth, dtype=np.float32), rounds, np.float32(step))
@@ -47,7 +47,7 @@ def grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, 
 
 @kernel
 def _grow(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: np.float32) -> None:
-    """As :func:`grown`, in place; a pixel takes the label of its neighbour to the right, left, below or above."""
+    """As :func:`grow`, in place; a pixel takes the label of its neighbour to the right, left, below or above."""
     height, width = labels.shape
     chosen = np.empty(free.size, np.int32)
     left = free.size

@@ -75,7 +75,7 @@ class Metres:
     notes: tuple[str, ...] = ()
 
 
-def stated(value: float, where: str) -> Stated:
+def parse_scale(value: float, where: str) -> Stated:
     """The unit of a ``depth_scale``, whose convention shows in its magnitude; ValueError unless it is positive."""
     if not 0 < value < math.inf:
         raise ValueError(f"{where}: expected a positive number, got {value:g}")

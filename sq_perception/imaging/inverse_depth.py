@@ -108,13 +108,13 @@ class InverseDepth:
             behind &= column < np.maximum.accumulate(column, axis=1)
         return behind | (self.slope_u * np.float32(self.camera.fx * baseline) >= 1)
 
-    def displaced(self, v: np.ndarray, u: np.ndarray, down: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def shift(self, v: np.ndarray, u: np.ndarray, down: np.ndarray, right: np.ndarray) -> np.ndarray:
         """Inverse depth in pixels (n,) of the surfaces that pixels ``down`` and ``right`` of them see, continued."""
         seen = self.w[v + down, u + right]
         moved = seen - self.slope_u[v + down, u + right] * right - self.slope_v[v + down, u + right] * down
         return np.where(seen > 0, np.maximum(moved, 0), 0).astype(np.float32)
 
-    def fattened(self, pixels: int) -> tuple[InverseDepth, np.ndarray]:
+    def dilate(self, pixels: int) -> tuple[InverseDepth, np.ndarray]:
         """The image with its foregrounds grown, and where they have grown to."""
         brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
         near_jump = cv2.dilate(beside(self.jumps()).view(np.uint8), brush).view(bool)

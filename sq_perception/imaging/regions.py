@@ -85,7 +85,7 @@ def fills(mask_box: tuple[int, int, int, int], measured: np.ndarray) -> bool:
 
 
 @kernel
-def renumbered(labels: np.ndarray, number: np.ndarray) -> np.ndarray:
+def renumber(labels: np.ndarray, number: np.ndarray) -> np.ndarray:
     """Labels int32 (height, width) with other ones in their place: ``number`` (count + 1,) gives that of each."""
     found = np.empty(labels.shape, np.int32)
     for v in range(labels.shape[0]):

@@ -61,7 +61,7 @@ class CheckpointError(ValueError):
     """A weights file that is missing, damaged, or of another kind; the message names which."""
 
 
-def shipped() -> dict[str, Path]:
+def shipped_weights() -> dict[str, Path]:
     """The weights that ship with the package, by name."""
     folder = Path(str(resources.files("sq_perception") / "weights"))
     return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
@@ -69,7 +69,7 @@ def shipped() -> dict[str, Path]:
 
 def shipped_regressors() -> dict[str, Path]:
     """The weights that ship with the package and predict a body, by name."""
-    return {name: path for name, path in shipped().items() if read_header(path).get("format") == FORMAT}
+    return {name: path for name, path in shipped_weights().items() if read_header(path).get("format") == FORMAT}
 
 
 def resolve(model: Path | str | None = None) -> Path:
@@ -77,7 +77,7 @@ def resolve(model: Path | str | None = None) -> Path:
     if model is None:
         model = DEFAULT
     path = Path(model)
-    return path if path.suffix else shipped().get(str(model), path)
+    return path if path.suffix else shipped_weights().get(str(model), path)
 
 
 def save(
@@ -146,7 +146,7 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
     """
     path = resolve(_SHIPPED[kind] if path is None else path)
     data, _ = _bytes(path)
-    config = _described(path, _strings(path, data, len(data)), kind)
+    config = _parse_config(path, _strings(path, data, len(data)), kind)
     try:
         stored = arrays_of(data)
     except (SafetensorError, ValueError, KeyError) as error:
@@ -186,7 +186,7 @@ def check(path: Path | str | None = None) -> None:
     path = resolve(path)
     header = read_header(path)
     kind: type[Any] = ThingConfig if header.get("format") == THING_FORMAT else RegressorConfig
-    _described(path, header, kind)
+    _parse_config(path, header, kind)
 
 
 def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:
@@ -227,7 +227,7 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
     return strings
 
 
-def _described(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
+def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
     """The form that a header describes.
 
     Raises

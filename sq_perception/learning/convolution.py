@@ -57,7 +57,7 @@ class Memory(threading.local):
             known = self._arrays[name] = np.zeros(shape, np.float32)
         return known[: shape[0]]
 
-    def framed(self, name: str, count: int, side: int, channels: int) -> np.ndarray:
+    def framed_images(self, name: str, count: int, side: int, channels: int) -> np.ndarray:
         """Square images with a margin of one pixel, and more where tiles of 4 x 4 reach beyond."""
         whole = side + 2 + -side % 4
         return self.zeros(name, (count, whole, whole, channels))
@@ -78,7 +78,7 @@ class Direct:
 
     @classmethod
     def folded(cls, weights: Weights, name: str, norm: str, stride: int) -> Direct:
-        kernels, bias = _folded(weights, name, norm)
+        kernels, bias = _fold_norm(weights, name, norm)
         matrix = kernels.transpose(2, 3, 1, 0).reshape(-1, kernels.shape[0])
         return cls(contiguous(matrix), bias, kernels.shape[2], stride)
 
@@ -102,7 +102,7 @@ class Direct:
     ) -> np.ndarray:
         """Framed images of ``side`` pixels a side; ``skip``, images with that margin, is added to the sums."""
         products = self.products(x, 0, side, memory, "products")
-        out = memory.framed(name, len(x), side, self.channels)
+        out = memory.framed_images(name, len(x), side, self.channels)
         _write_sums(products, self.bias, out if skip is None else skip, skip is not None, margin, side, out)
         return out
 
@@ -116,7 +116,7 @@ class _Tiled:
 
     @classmethod
     def folded(cls, weights: Weights, name: str, norm: str) -> _Tiled:
-        kernels, bias = _folded(weights, name, norm)
+        kernels, bias = _fold_norm(weights, name, norm)
         inputs = kernels.shape[1]
         g = _G[4 if inputs >= _WIDE else 6]
         # g w g^T of all kernels as one product: a sum over four indices takes thirty times as long, at every start.
@@ -130,7 +130,7 @@ class _Tiled:
         """As :meth:`Direct.computed`."""
         squares, inputs, outputs = self.matrices.shape
         size = math.isqrt(squares)
-        out = memory.framed(name, len(x), side, outputs)
+        out = memory.framed_images(name, len(x), side, outputs)
         tiles = math.ceil(side / (size - 2)) ** 2
         for part in _parts(len(x), tiles, squares * inputs):
             count = (part.stop - part.start) * tiles
@@ -153,9 +153,9 @@ class Block:
 
     @classmethod
     def folded(cls, weights: Weights, name: str) -> Block:
-        second = _kept(weights, f"{name}.second", f"{name}.second_norm")
+        second = _keep_resolution(weights, f"{name}.second", f"{name}.second_norm")
         if f"{name}.shortcut.0.weight" not in weights:
-            return cls(_kept(weights, f"{name}.first", f"{name}.first_norm"), second, None)
+            return cls(_keep_resolution(weights, f"{name}.first", f"{name}.first_norm"), second, None)
         shortcut = Direct.folded(weights, f"{name}.shortcut.0", f"{name}.shortcut.1", stride=2)
         second = replace(second, bias=second.bias + shortcut.bias)
         return cls(Direct.folded(weights, f"{name}.first", f"{name}.first_norm", stride=2), second, shortcut)
@@ -171,7 +171,7 @@ class Block:
         return self.second.computed(y, side, memory, f"{name} second", skip, margin), side
 
 
-def _kept(weights: Weights, name: str, norm: str) -> Direct | _Tiled:
+def _keep_resolution(weights: Weights, name: str, norm: str) -> Direct | _Tiled:
     """A convolution that keeps the resolution."""
     if weights[f"{name}.weight"].shape[1] <= _FEW:
         return Direct.folded(weights, name, norm, stride=1)
@@ -184,7 +184,7 @@ def _parts(images: int, rows: int, columns: int) -> Iterator[slice]:
     return (slice(first, min(first + at_once, images)) for first in range(0, images, at_once))
 
 
-def _folded(weights: Weights, name: str, norm: str) -> tuple[np.ndarray, np.ndarray]:
+def _fold_norm(weights: Weights, name: str, norm: str) -> tuple[np.ndarray, np.ndarray]:
     """Kernels (k, c, s, s) with their normalisation, and their biases."""
     scale, shift, mean, variance = (
         weights[f"{norm}.{part}"].astype(float) for part in ("weight", "bias", "running_mean", "running_var")

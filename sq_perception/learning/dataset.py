@@ -90,24 +90,19 @@ def draw_views(
     return render_views(bodies, source.pixels, np.full(count, GREY_LEVELS), distance, occluder, miss)
 
 
-def grey_frames(
-    bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS, dtype: type[np.unsignedinteger] = np.uint8
-) -> np.ndarray:
-    """The thesis' images (n, p, p) of bodies (n,) of the cube frame, in 8 or 16 bit grey levels, 0 for background."""
-    camera = unit_cube.camera(pixels)
-    frames = np.empty((len(bodies), pixels, pixels), dtype=dtype)
-    for frame, body in zip(frames, unit_cube.optical_from_cube(bodies), strict=True):
-        frame[:] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], dtype)
-    return frames
-
-
 def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
-    """The thesis' 8 bit images as a network takes them: float32 (n, p, p), z of the surface, 0 for background."""
-    grey = grey_frames(bodies, pixels)
+    """Render the thesis' 8 bit images of bodies (n,) of the cube frame, as a network takes them.
+
+    Returns float32 (n, p, p), z of the surface, 0 for background.
+    """
+    camera = unit_cube.camera(pixels)
+    grey = np.empty((len(bodies), pixels, pixels), np.uint8)
+    for frame, body in zip(grey, unit_cube.optical_from_cube(bodies), strict=True):
+        frame[:] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], np.uint8)
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 
-def moved_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
+def move_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
     """Images (n, p, p) in positions (n,)."""
     images = np.where(mirror[:, None, None], images[:, :, ::-1], images)
     out = np.empty_like(images)
@@ -117,7 +112,7 @@ def moved_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> n
     return out
 
 
-def moved_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
+def move_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
     """The bodies (n,) of those images."""
     sign = np.where(mirror, -1.0, 1.0)
     centred = bodies.translation - 0.5
@@ -128,12 +123,12 @@ def moved_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) ->
     return Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
 
 
-def turned_at_random(
+def turn_at_random(
     images: np.ndarray, bodies: Superquadric, rng: np.random.Generator
 ) -> tuple[np.ndarray, Superquadric]:
     """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
     turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
-    return moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+    return move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
 
 
 class ViewPool:
@@ -161,5 +156,5 @@ class ViewPool:
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
         bodies = Superquadric.from_flat(self._flat[chosen])
-        views, bodies = turned_at_random(self._images[chosen], bodies, self._rng)
-        return self._source.disturbance.applied(views, self._rng), bodies
+        views, bodies = turn_at_random(self._images[chosen], bodies, self._rng)
+        return self._source.disturbance.apply(views, self._rng), bodies

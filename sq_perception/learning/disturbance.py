@@ -53,7 +53,7 @@ class Disturbance:
             return None
         return np.where(rng.random((count, 1)) < self.noisy_share, _FRAMING * rng.standard_normal((count, 4)), 0.0)
 
-    def applied(self, views: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def apply(self, views: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Views (n, p, p), some of them with noise, steps, holes and wrong edges; the argument is left as it is."""
         if self.noisy_share == 0:
             return views

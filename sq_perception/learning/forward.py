@@ -24,8 +24,8 @@ from sq_perception.learning.network_config import (
     MaskConfig,
     RegressorConfig,
     ThingConfig,
-    checked_views,
-    shown_beside,
+    check_views,
+    side_inputs,
 )
 
 _AT_ONCE = 40
@@ -41,7 +41,7 @@ class CompactRegressor:
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """As :meth:`sq_perception.learning.regressor.Regressor.predict`, errors included."""
-        views = checked_views(views, self.config)
+        views = check_views(views, self.config)
         raw = self._network.outputs(views[..., None], np.empty((len(views), 0), np.float32))
         return self.config.decode(raw.astype(float))
 
@@ -58,7 +58,7 @@ class CompactThings:
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
         """As :meth:`sq_perception.learning.thing_network.ThingNetwork.predict`, without torch."""
-        heights, scale = shown_beside(views, planes, extents)
+        heights, scale = side_inputs(views, planes, extents)
         images = np.stack([views, heights], axis=-1)
         raw = self._network.outputs(images, np.column_stack([planes, scale]))
         count = len(DIRECTIONS)
@@ -91,7 +91,7 @@ class CompactMasks:
             x, side = stages.pop()
             for k in reversed(range(len(stages))):
                 x, side = self._joined[k].computed(
-                    _raised(x, side, self._up[k], stages[k][0], memory), 2 * side, memory, f"joined {k}"
+                    _upsample(x, side, self._up[k], stages[k][0], memory), 2 * side, memory, f"joined {k}"
                 )
             matrix, bias = self._head
             cells = (_inner(x, side) @ matrix + bias).reshape(len(x), side, side, 2, 2)
@@ -158,12 +158,12 @@ def _inner(framed: np.ndarray, side: int) -> np.ndarray:
     return framed[:, 1 : side + 1, 1 : side + 1]
 
 
-def _raised(
+def _upsample(
     x: np.ndarray, side: int, up: tuple[np.ndarray, np.ndarray], finer: np.ndarray, memory: Memory
 ) -> np.ndarray:
     """Framed images of twice the side: those of single pixels by ``up``, doubled, added to ``finer``."""
     matrix, bias = up
-    sums = memory.framed(f"raised to {2 * side}", len(x), 2 * side, len(bias))
+    sums = memory.framed_images(f"raised to {2 * side}", len(x), 2 * side, len(bias))
     write_doubled(_inner(x, side) @ matrix + bias, finer, sums)
     return sums
 

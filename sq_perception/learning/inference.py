@@ -26,13 +26,13 @@ from sq_perception.geometry.threads import one_torch_thread
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
-from sq_perception.learning.mirror_images import predicted_both_ways
+from sq_perception.learning.mirror_images import predict_with_mirror
 from sq_perception.learning.network_config import (
     MaskConfig,
     RegressorConfig,
     ThingConfig,
-    checked_views,
-    mirrored_planes,
+    check_views,
+    mirror_planes,
 )
 
 if TYPE_CHECKING:
@@ -105,10 +105,10 @@ class ThingPredictor:
         ValueError
             For views of another form, or not finite.
         """
-        views = checked_views(views, self.config.regressor())
+        views = check_views(views, self.config.regressor())
         both = np.concatenate([views, views[:, :, ::-1]])
         sides = np.concatenate([extents, extents]).astype(np.float32)
-        supports = np.concatenate([planes, mirrored_planes(planes)]).astype(np.float32)
+        supports = np.concatenate([planes, mirror_planes(planes)]).astype(np.float32)
         bodies, support, covariance = self._network.predict(both, supports, sides)
         straight, turned = np.split(support, 2)
         of_straight, of_turned = np.split(covariance, 2)
@@ -141,7 +141,7 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
-    """A predictor of hulls, None for the network that ships; the device is one that :func:`checked_device` has seen.
+    """A predictor of hulls, None for the network that ships; the device is one that :func:`check_device` has seen.
 
     Raises
     ------
@@ -172,7 +172,7 @@ class _BothWays:
         self._model = model
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        return predicted_both_ways(self._model.predict, checked_views(views, self.config))
+        return predict_with_mirror(self._model.predict, check_views(views, self.config))
 
 
 class _OnOneThread:
@@ -191,7 +191,7 @@ def _is_cpu(device: str) -> bool:
     return device.partition(":")[0] == "cpu"
 
 
-def checked_device(device: str) -> str:
+def check_device(device: str) -> str:
     """The name of a device that is there, as torch names it.
 
     Raises

@@ -63,9 +63,9 @@ def _masks(config: MaskConfig) -> Shapes:
     found: Shapes = {}
     _compact(found, config.widths, config.blocks, CHANNELS)
     for k, (fine, coarse) in enumerate(pairwise(config.widths)):
-        _biased(found, f"up.{k}", coarse, fine)
+        _add_pointwise(found, f"up.{k}", coarse, fine)
         _block(found, f"joined.{k}", BLOCK, fine, fine, False)
-    _biased(found, "head", config.widths[0], CELLS_AT_ONCE)
+    _add_pointwise(found, "head", config.widths[0], CELLS_AT_ONCE)
     return found
 
 
@@ -122,7 +122,7 @@ def _convolution(found: Shapes, name: str, norm: str, channels_in: int, channels
         found[f"{norm}.{part}"] = (channels_out,)
 
 
-def _biased(found: Shapes, name: str, channels_in: int, channels_out: int) -> None:
+def _add_pointwise(found: Shapes, name: str, channels_in: int, channels_out: int) -> None:
     """A convolution of single pixels."""
     found[f"{name}.weight"], found[f"{name}.bias"] = (channels_out, channels_in, 1, 1), (channels_out,)
 

@@ -115,7 +115,7 @@ def occupancy_loss(
     return (difference * difference).mean(dim=-1)
 
 
-def turned_truth(prediction: Superquadric, truth: Superquadric) -> Superquadric:
+def turn_truth(prediction: Superquadric, truth: Superquadric) -> Superquadric:
     """The true bodies in the predicted rotations: all that L_OC(q) sees of a prediction."""
     return Superquadric(truth.size, truth.shape, truth.translation, prediction.rotation)
 
@@ -124,7 +124,7 @@ def rotation_loss(
     prediction: Superquadric, truth: Superquadric, points: torch.Tensor, sharpness: float
 ) -> torch.Tensor:
     """L_OC(q) of each body, shape (n,): :func:`occupancy_loss` of the predicted rotation alone."""
-    return occupancy_loss(turned_truth(prediction, truth), truth, points, sharpness)
+    return occupancy_loss(turn_truth(prediction, truth), truth, points, sharpness)
 
 
 def dual_loss(prediction: Superquadric, truth: Superquadric, points: torch.Tensor, sharpness: float) -> torch.Tensor:
@@ -247,4 +247,4 @@ class Objective:
         """The bodies that a validation compares with the true ones: what is given counts as predicted."""
         if self.name == "mse":
             return Superquadric(prediction.size, prediction.shape, prediction.translation, truth.rotation)
-        return turned_truth(prediction, truth) if self.name == "occupancy_rotation" else prediction
+        return turn_truth(prediction, truth) if self.name == "occupancy_rotation" else prediction

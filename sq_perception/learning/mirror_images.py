@@ -19,13 +19,13 @@ _FARTHEST = float(np.cos(np.deg2rad(15.0)))
 _TURN = np.array([1.0, -1.0, -1.0, 1.0])
 
 
-def predicted_both_ways(predict: Callable[[np.ndarray], Superquadric], views: np.ndarray) -> Superquadric:
+def predict_with_mirror(predict: Callable[[np.ndarray], Superquadric], views: np.ndarray) -> Superquadric:
     """Bodies (n,) of views (n, p, p), of which ``predict`` gives those of any number of views."""
     both = predict(np.concatenate([views, views[:, :, ::-1]]))
-    return mean(both[: len(views)], mirrored(both[len(views) :]))
+    return mean(both[: len(views)], mirror(both[len(views) :]))
 
 
-def mirrored(bodies: Superquadric) -> Superquadric:
+def mirror(bodies: Superquadric) -> Superquadric:
     """The mirror images of bodies (n,) of the unit cube, x' = 1 - x."""
     translation = np.concatenate([1 - bodies.translation[:, :1], bodies.translation[:, 1:]], axis=1)
     return Superquadric(bodies.size, bodies.shape, translation, bodies.rotation * _TURN)

@@ -153,7 +153,7 @@ class MaskConfig:
     """Residual blocks a stage on the way down."""
 
 
-def shown_beside(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:
+def side_inputs(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:
     """What the network of things is shown beside views (b, p, p): heights (b, p, p) above planes (b, 4), and logarithms
     (b,) of the views' sides ``extents`` (b,), metres, 0 for an unknown side.
 
@@ -169,12 +169,12 @@ def shown_beside(views: Array, planes: Array, extents: Array) -> tuple[Array, Ar
     return heights, xp.log(xp.where(extents > 0, extents, usual) / usual)
 
 
-def mirrored_planes(planes: np.ndarray) -> np.ndarray:
+def mirror_planes(planes: np.ndarray) -> np.ndarray:
     """Planes (b, 4) of views whose x runs the other way."""
     return np.stack([-planes[:, 0], planes[:, 1], planes[:, 2], planes[:, 3] + planes[:, 0]], axis=1)
 
 
-def checked_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
+def check_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
     """Views (n, p, p) as contiguous float32; raises ValueError if they are of another form, or not finite."""
     expected = (config.pixels, config.pixels)
     if views.ndim != 3 or views.shape[1:] != expected:

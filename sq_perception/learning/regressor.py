@@ -23,7 +23,7 @@ from torch import nn
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning.backbone import ResNet18, compact_backbone, fold
-from sq_perception.learning.network_config import RegressorConfig, checked_views
+from sq_perception.learning.network_config import RegressorConfig, check_views
 
 
 class Regressor(nn.Module):
@@ -71,7 +71,7 @@ class Regressor(nn.Module):
         ValueError
             If the views are not (n, p, p) with p = ``config.pixels``, or not finite.
         """
-        batch = torch.from_numpy(checked_views(views, self.config))[:, None]
+        batch = torch.from_numpy(check_views(views, self.config))[:, None]
         self.eval()
         device = next(self.parameters()).device
         with torch.inference_mode():

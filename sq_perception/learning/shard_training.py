@@ -33,11 +33,11 @@ from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file
 from sq_perception.learning import checkpoint
-from sq_perception.learning.inference import checked_device
+from sq_perception.learning.inference import check_device
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.thing_network import ThingNetwork
 from sq_perception.learning.training_config import ShardTraining
-from sq_perception.learning.training_state import TrainingState, made_by, mixed_precision
+from sq_perception.learning.training_state import TrainingState, mixed_precision, provenance_of
 
 _WARM_UP = 100
 """Steps over which the learning rate rises."""
@@ -81,7 +81,7 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
             print(f"{path}: there already")
             continue
         drawn = draw(np.random.default_rng([seed, k]))
-        output_file.write(path, bytes_of(_stored(drawn)))
+        output_file.write(path, bytes_of(_to_stored(drawn)))
         print(f"{path}: {len(drawn.images)} views")
 
 
@@ -98,7 +98,7 @@ def read_views(none: Views, paths: list[Path]) -> Views:
         try:
             arrays = load_arrays(str(path))
             shards.append([arrays[name] for name in vars(none)])
-            for (name, wanted), array in zip(_stored(none).items(), shards[-1], strict=True):
+            for (name, wanted), array in zip(_to_stored(none).items(), shards[-1], strict=True):
                 shape = len(shards[-1][0]), *wanted.shape[1:]
                 if array.shape != shape or array.dtype != wanted.dtype:
                     raise ValueError(f"{name}: expected {wanted.dtype} {shape}, got {array.dtype} {array.shape}")
@@ -109,7 +109,7 @@ def read_views(none: Views, paths: list[Path]) -> Views:
     return kind(*(np.concatenate(parts) for parts in zip(*shards, strict=True)))
 
 
-def _stored(views: Any) -> dict[str, np.ndarray]:
+def _to_stored(views: Any) -> dict[str, np.ndarray]:
     """Views as a shard holds them."""
     return {**vars(views), "images": views.images.astype(np.float16)}
 
@@ -129,7 +129,7 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     ArithmeticError
         If the loss or a gradient is no longer finite; the last state that was saved stays.
     """
-    device = torch.device(checked_device(config.device))
+    device = torch.device(check_device(config.device))
     if config.threads:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
@@ -205,6 +205,6 @@ def _keep(
     state.log(record)
     state.save()
     training = {**asdict(config), "start": Path(config.start).name}
-    made = made_by(f"train-{subject.name}", next(state.model.parameters()).device)
+    made = provenance_of(f"train-{subject.name}", next(state.model.parameters()).device)
     facts = {"training": training, "made": made, "validation": record}
     checkpoint.save(output / f"{subject.name}.safetensors", state.average, facts)

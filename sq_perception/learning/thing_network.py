@@ -48,7 +48,7 @@ from sq_perception.learning.network_config import (
     MOST_LOG,
     PLANE,
     ThingConfig,
-    shown_beside,
+    side_inputs,
 )
 
 MIDDLE = (0.5, 0.5, NEAREST)
@@ -135,7 +135,7 @@ class ThingNetwork(nn.Module):
             self.factor_head.weight.mul_(0.1)
 
     def forward(self, views: torch.Tensor, planes: torch.Tensor, extents: torch.Tensor) -> HullPrediction:
-        heights, scale = shown_beside(views, planes, extents)
+        heights, scale = side_inputs(views, planes, extents)
         h = self.features(torch.stack([views, heights], dim=1)).flatten(1)
         h = self.mixer(torch.cat([h, planes.to(h.dtype), scale[:, None].to(h.dtype)], dim=1)).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size

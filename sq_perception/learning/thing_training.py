@@ -21,7 +21,7 @@ import torch
 
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
-from sq_perception.learning.network_config import mirrored_planes
+from sq_perception.learning.network_config import mirror_planes
 from sq_perception.learning.shard_training import Subject
 from sq_perception.learning.thing_network import HullPrediction, ThingNetwork
 from sq_perception.simulation.household import KINDS
@@ -46,7 +46,7 @@ def hull_loss(
     )
 
 
-def calibrated_spread(network: ThingNetwork, views: ThingViews) -> float:
+def calibrate_spread(network: ThingNetwork, views: ThingViews) -> float:
     """The factor of S with which error / sigma deviates by 1, now that the network predicts and does not learn.
 
     The likelihood would ask for less: where the tails of the errors are longer than those of the t distribution they
@@ -104,14 +104,14 @@ def _batch(views: ThingViews, chosen: np.ndarray, rng: np.random.Generator) -> t
     extents = np.where(rng.random(len(chosen)) < _UNKNOWN_EXTENT, np.float32(0), views.extents[chosen])
     turned = rng.random(len(chosen)) < 0.5
     images[turned] = images[turned][:, :, ::-1]
-    planes = np.where(turned[:, None], mirrored_planes(planes), planes)
+    planes = np.where(turned[:, None], mirror_planes(planes), planes)
     support = np.where(turned[:, None], support[:, mirrored(0)], support)
     return tuple(map(torch.from_numpy, (images, planes, extents, support)))
 
 
 def _calibrate(network: ThingNetwork, views: ThingViews) -> None:
     """Give the network the spread that its errors on these views have; 4000 of them settle it to 2 %."""
-    network.config = replace(network.config, spread=calibrated_spread(network, views))
+    network.config = replace(network.config, spread=calibrate_spread(network, views))
 
 
 THINGS = Subject(

@@ -29,16 +29,15 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
-from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
-from sq_perception.learning.inference import checked_device
+from sq_perception.learning.inference import check_device
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 from sq_perception.learning.training_state import (
     SETTINGS,
     TrainingState,
-    made_by,
     mixed_precision,
+    provenance_of,
     recalibrate,
 )
 
@@ -95,7 +94,7 @@ def train(
     ValueError
         For a device that this machine does not have, or data or a network to begin with of another form.
     """
-    device = torch.device(checked_device(config.device))
+    device = torch.device(check_device(config.device))
     with _threads(config.threads), _stop_requests() as stop_requested:
         output.mkdir(parents=True, exist_ok=True)
         torch.manual_seed(config.seed)
@@ -116,7 +115,7 @@ def train(
         generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
         batches = _batches(config, model.config, np.random.default_rng(seed))
         validation = _validation_sets(config, model.config)
-        notes = {"training": asdict(config), "made": made_by("train", device)}
+        notes = {"training": asdict(config), "made": provenance_of("train", device)}
         started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
         while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
             progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
@@ -139,9 +138,9 @@ def train(
                     _recalibrate(state.average, batches, config.batch)
                 record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
                 record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
-                record |= _validated(state.average, validation, objective)
+                record |= _validate_sets(state.average, validation, objective)
                 _keep(output, state, record, notes)
-                state.plateau.validated(1 - record["iou"])
+                state.plateau.record(1 - record["iou"])
                 losses.clear()
             due = time.monotonic() - saved > _SAVE_SECONDS
             if state.step % config.validation == 0 or finished or stopping or due:
@@ -216,33 +215,24 @@ def _truth(bodies: Superquadric, config: TrainingConfig, device: torch.device) -
     return Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
 
 
-def _recalibrate(model: Regressor, batches: ViewPool | ShuffledBatches, batch: int) -> None:
+def _recalibrate(model: Regressor, batches: ViewPool, batch: int) -> None:
     """Measure the normalisations of an averaged network anew, on views of the training."""
     views, _ = batches.batch(max(CALIBRATION_VIEWS, batch))
     recalibrate(model, torch.from_numpy(views)[:, None], max(batch, _CALIBRATION_BATCH))
 
 
-def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> ViewPool | ShuffledBatches:
-    if not config.data:
-        # A short run holds no more views than it takes.
-        taken = max(config.steps * config.batch, CALIBRATION_VIEWS if config.average > 0 else 0)
-        disturbance = Disturbance(config.occluded_share, config.noisy_share)
-        source = ViewSource(network.pixels, config.pinhole_share, config.wide_share, disturbance, network.framing)
-        return ViewPool(rng, source, min(POOL, taken), config.reuse)
-    fixed = FixedSet(Path(config.data), "train")
-    theirs = fixed.settings
-    if (theirs.pixels, theirs.framing) != (network.pixels, network.framing):
-        raise ValueError(
-            f"{config.data}: expected {network.framing} views of {network.pixels} pixels, "
-            f"got {theirs.framing} ones of {theirs.pixels}"
-        )
-    return ShuffledBatches(fixed, rng)
+def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> ViewPool:
+    # A short run holds no more views than it takes.
+    taken = max(config.steps * config.batch, CALIBRATION_VIEWS if config.average > 0 else 0)
+    disturbance = Disturbance(config.occluded_share, config.noisy_share)
+    source = ViewSource(network.pixels, config.pinhole_share, config.wide_share, disturbance, network.framing)
+    return ViewPool(rng, source, min(POOL, taken), config.reuse)
 
 
 def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[str, tuple[np.ndarray, Superquadric]]:
     """Views and bodies that no run trains on: the thesis' images, and what a real camera makes of them."""
     count, pixels = config.validation, network.pixels
-    # A seed of its own kind: [0], [0, 0] and [0, 0, 0], of a run and of a fixed set, are the same numbers.
+    # A seed of its own kind: [0] and [0, 0], of a run, are the same numbers.
     seed = np.random.SeedSequence(0, spawn_key=(0,))
     sets = {"iou": draw_views(count, np.random.default_rng(seed), ViewSource(pixels, framing=network.framing))}
     if config.pinhole_share > 0:
@@ -250,7 +240,7 @@ def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[s
     if config.noisy_share > 0:
         rng = np.random.default_rng(seed)
         near, bodies = draw_views(count, rng, ViewSource(pixels, config.pinhole_share))
-        sets["iou_worn"] = Disturbance(noisy_share=1.0).applied(near, rng), bodies
+        sets["iou_worn"] = Disturbance(noisy_share=1.0).apply(near, rng), bodies
     if config.occluded_share > 0:
         rng = np.random.default_rng(seed)
         occluder = any_occluder(np.full(count, VALIDATION_HIDDEN), rng)
@@ -260,7 +250,7 @@ def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[s
     return sets
 
 
-def _validated(
+def _validate_sets(
     model: Regressor, sets: dict[str, tuple[np.ndarray, Superquadric]], objective: Objective
 ) -> dict[str, float]:
     record = {}

@@ -65,7 +65,7 @@ class Plateau:
         """By which the learning rate is multiplied."""
         return _FACTOR**self.reductions
 
-    def validated(self, loss: float) -> None:
+    def record(self, loss: float) -> None:
         """Take note of a validation's loss."""
         if loss < self.best:
             self.best, self.without_progress = loss, 0
@@ -99,9 +99,6 @@ class TrainingConfig:
         64, "Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."
     )
     start: str = _setting("", "A model file whose weights the network begins with; empty begins at random.")
-    data: str = _setting(
-        "", "Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."
-    )
     canonical_labels: bool = _setting(
         False, "List the axes of every label so that a1 >= a2; as drawn, their order is random."
     )
@@ -166,8 +163,6 @@ class TrainingConfig:
             raise ValueError(f"{self.loss} takes each view as it is; occluders and noise need a loss with labels")
         if self.framing == "full" and (self.pinhole_share or self.occluded_share or self.noisy_share):
             raise ValueError("full frames are the thesis' images: orthographic, whole and clean")
-        if self.data and (self.pinhole_share or self.wide_share or self.marks_hidden):
-            raise ValueError("data: the views of a fixed set are drawn already: expected shares of 0")
 
     @property
     def marks_hidden(self) -> bool:
@@ -230,17 +225,17 @@ def read(path: str | Path, **changes: Any) -> TrainingConfig:
     return TrainingConfig(**{**_values(path), **changes})
 
 
-def shipped() -> list[str]:
+def shipped_names() -> list[str]:
     """Names of the configurations that travel with the package."""
     return sorted(path.stem for path in _SHIPPED.glob("*.yaml"))
 
 
 def _values(path: str | Path) -> dict[str, Any]:
     source = Path(path)
-    if str(path) in shipped():
+    if str(path) in shipped_names():
         source = _SHIPPED / f"{path}.yaml"
     if not source.is_file():
-        raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped())}")
+        raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped_names())}")
     try:
         values = plain_yaml.read(source) or {}
     except plain_yaml.YamlError as error:

@@ -46,7 +46,7 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
     return torch.autocast(device, torch.bfloat16, enabled=wanted and has_products)
 
 
-def made_by(command: str, device: torch.device) -> dict[str, Any]:
+def provenance_of(command: str, device: torch.device) -> dict[str, Any]:
     """Where the weights of a run come from, the graphics card among it: :func:`provenance.facts`."""
     facts = provenance.facts(f"sq-perception {command}")
     return facts if device.type == "cpu" else {**facts, "device": torch.cuda.get_device_name(device)}

@@ -1,4 +1,4 @@
-"""The node of ``sq-perception demo``: collects images, their true bodies, and what two nodes find in them."""
+"""The node of ``sq-perception demo``: collects images, their true bodies, and the results of two nodes."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ _PATIENCE = 600.0
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One image: its depth (height, width), metres, its true bodies (n,), and by node what was found (m,) and after how
-    many milliseconds."""
+    """One image: depth (height, width), metres, true bodies (n,); per node its bodies (m,) and the milliseconds it
+    took."""
 
     depth: np.ndarray
     truth: Superquadric
@@ -39,7 +39,7 @@ class Shot:
 
 
 class DemoNode(Node):
-    """Ends the process, as Ctrl-C does, ``seconds`` after the first image that all of ``nodes`` have answered.
+    """Node that ends the process ``seconds`` after the first image that all of ``nodes`` have answered.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class DemoNode(Node):
         self.create_timer(0.1, self._look_at_clock)
 
     def close(self) -> bool:
-        """There is nothing to wait for."""
+        """Return at once: there is nothing to wait for."""
         return True
 
     def _look_at_clock(self) -> None:

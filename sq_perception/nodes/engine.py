@@ -1,11 +1,11 @@
-"""The recoverer of a frame node: made in a thread of its own, swapped as a whole, shared by the nodes of a process.
+"""The recoverer of a frame node: made in its own thread, replaced as a whole, shared by the nodes of a process.
 
-A change of the parameters that a recoverer is made of (model, device ...) makes another one in a thread of its own,
-warmed up before it is used.  Frames go on with the old one, and with those parameters as they were, until the new one
-is ready.  One that cannot be made leaves the old one at work, and :attr:`Engine.fault` has the reason.
+After a change of its parameters (model, device ...) a new recoverer is made and warmed up in its own thread.  Frames
+use the old one, with the old parameters, until the new one is ready.  If it cannot be made, the old one stays active
+and :attr:`Engine.fault` has the reason.
 
-Nodes of one process that ask for equal recoverers get one.  One frame is computed at a time in a process, in the order
-of asking (:class:`Turns`): a frame already uses every core, two at once would each take twice as long.
+Nodes of one process share equal recoverers.  A process computes one frame at a time, in the order of requests
+(:class:`Turns`): a frame already uses every core, so two at once would each take twice as long.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 
 
 class Turns:
-    """A lock that is given in the order in which it was asked for, so that no camera starves."""
+    """Lock that is granted in the order of requests, so that no camera starves."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -51,7 +51,7 @@ class Turns:
 
     @contextmanager
     def turn(self) -> Iterator[None]:
-        """Wait for the caller's turn, and hold it for the block."""
+        """Wait for the caller's turn, and hold it within the block."""
         self._take()
         try:
             yield
@@ -60,7 +60,7 @@ class Turns:
 
     @contextmanager
     def pause(self) -> Iterator[None]:
-        """Give the caller's turn away for the block, and wait for another one at its end."""
+        """Give up the caller's turn within the block, and wait for another one at its end."""
         self._give()
         try:
             yield
@@ -95,7 +95,7 @@ class _Built:
 
 
 class Engine:
-    """The recoverer at work; see the module.  The node's log hears of swaps."""
+    """The active recoverer of a node, which logs swaps; see the module."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -112,27 +112,27 @@ class Engine:
         """Why the last swap failed; empty once one has succeeded."""
 
     def build(self, parameters: RecoverParameters) -> None:
-        """Make the recoverer and warm it up.  Raises ValueError if the model or the device cannot be used."""
+        """Make and warm up the recoverer.  Raises ValueError if the model or the device cannot be used."""
         self.release()
-        self._built = _made(parameters, None, lambda: True)
+        self._built = _make(parameters, None, lambda: True)
 
     def release(self) -> None:
-        """Let go of the recoverer, and of one that is being made."""
+        """Release the recoverer, and one that is being made."""
         with self._lock:
             self._request += 1
             self._built, self._last, self._is_to_read = None, {}, False
             self.is_making, self.fault = False, ""
 
     def discard(self) -> None:
-        """Let nobody else share the recoverer from now on: it has failed again and again."""
+        """Stop sharing the recoverer, since it has failed repeatedly."""
         with _making:
             if self._built is not None and _shared.get(self._built.key) is self._built.recoverer:
                 del _shared[self._built.key]
 
     def check(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
-        """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that is known at once."""
+        """Raise ValueError for parameters that :meth:`follow` could not apply, as far as this is known at once."""
         if "device" in changed:
-            inference.checked_device(parameters.device)
+            inference.check_device(parameters.device)
         reads = not changed.isdisjoint(_READ_BY)
         if self._built is not None and "method" in changed:
             reads = reads or not self._built.recoverer.has_weights
@@ -143,7 +143,7 @@ class Engine:
                 raise ValueError(f"model: {error}") from error
 
     def follow(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
-        """Swap the recoverer where a parameter that it is made of has been set, in the background.
+        """Replace the recoverer in the background if one of its parameters has changed.
 
         A set that leaves the value as it is counts too: it is how a model file that was replaced is read again.
         """
@@ -157,7 +157,7 @@ class Engine:
         threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
 
     def recover(self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None) -> Answer:
-        """The bodies of a frame by the parameters in force, and a value that is equal for equal origins.
+        """Return the bodies of a frame with the current parameters, and a value that is equal for equal origins.
 
         ``pose`` is that of the frame in ``target_frame``, if there is one.  With ``tracking``, what did not change
         since the last frame is taken from its answer, if camera and origin are the same.
@@ -177,18 +177,18 @@ class Engine:
 
     @property
     def description(self) -> str:
-        """What is at work, for diagnostics."""
+        """Describe the active recoverer for diagnostics."""
         if (built := self._built) is None:
             return "none"
-        return _described(built.parameters) + (", another one is being made" if self.is_making else "")
+        return _describe(built.parameters) + (", another one is being made" if self.is_making else "")
 
     def _swap(self, request: int, parameters: RecoverParameters, kept: _Built | None) -> None:
         started, log = perf_counter(), self._node.get_logger()
         built, fault = None, ""
         try:
-            built = _made(parameters, kept, lambda: request == self._request)
+            built = _make(parameters, kept, lambda: request == self._request)
         except Exception as error:  # whatever it is: the old one goes on
-            fault = f"cannot change to {_described(parameters)}: {' '.join(str(error).split())}"
+            fault = f"cannot change to {_describe(parameters)}: {' '.join(str(error).split())}"
         with self._lock:
             if request != self._request:  # another one is wanted by now
                 return
@@ -196,13 +196,13 @@ class Engine:
             if built is not None:
                 self._built, self._is_to_read = built, False
         if fault:
-            log.error(f"{fault}; what was there before goes on")
+            log.error(f"{fault}; the previous one stays active")
         else:
-            log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
+            log.info(f"changed to {_describe(parameters)} within {perf_counter() - started:.1f} s")
 
 
-def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
-    """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if it is as good.
+def _make(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
+    """Return a warm recoverer, with the weights of ``kept`` if given; an existing one if it is equivalent.
 
     None if nobody wants it any more.
     """
@@ -230,7 +230,7 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
 
 
 def _file(model: str) -> Hashable:
-    """What tells the file of the weights from every other one, also from one that takes its name later."""
+    """Identify a weights file, also against one that is given its name later."""
     path = checkpoint.resolve(model or None)
     try:
         known = path.stat()
@@ -239,7 +239,7 @@ def _file(model: str) -> Hashable:
     return str(path.resolve()), known.st_ino, known.st_size, known.st_mtime_ns
 
 
-def _described(parameters: RecoverParameters) -> str:
+def _describe(parameters: RecoverParameters) -> str:
     if parameters.method not in NEEDS_NETWORK:
         return f"method {parameters.method}, no network"
     return f"method {parameters.method}, {parameters.model or 'default weights'} on {parameters.device}"

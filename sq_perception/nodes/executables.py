@@ -1,7 +1,7 @@
 """The programs of ``ros2 run sq_perception``: one function each, which returns the exit code.
 
 Each imports its node inside :func:`sq_perception.nodes.process.run`: numba and rclpy take seconds to import, and
-a Ctrl-C meanwhile must end the process without a traceback.
+a Ctrl-C during that time must end the process without a traceback.
 """
 
 # ruff: noqa: E402 - the imports below take long enough for a Ctrl-C
@@ -28,14 +28,14 @@ _ABOUT = {
     "recover_node": """\
 Depth images in, superquadrics out.
 
-takes      depth/image and depth/camera_info, or depth/points; mask/image if there are masks
+subscribes depth/image and depth/camera_info, or depth/points; mask/image if there are masks
 publishes  ~/superquadrics ~/markers ~/rendered_depth ~/support_plane /diagnostics
 services   ~/enable ~/trigger ~/recover, and those of a lifecycle node""",
     "fitter_node": "recover_node with the classic fit of Solina and Bajcsy, with the same topics.",
     "grasp_node": """\
 Superquadrics in, grasps of a parallel gripper out.
 
-takes      superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
+subscribes superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
 publishes  ~/grasps ~/grasp_details ~/markers /diagnostics
 services   ~/plan, ~/plan_grasps where moveit_msgs is installed, and those of a lifecycle node""",
     "synthetic_depth_node": """\
@@ -47,11 +47,10 @@ One process with a recover_node for each of several cameras, which share one net
 
     ros2 run sq_perception recover_cameras front wrist --ros-args --params-file cameras.yaml
 
-makes /front/recover_node and /wrist/recover_node, which take /front/depth/image, /wrist/depth/image and so on.
+makes /front/recover_node and /wrist/recover_node, which subscribe to /front/depth/image, /wrist/depth/image and so on.
 Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_node: for one.
 
-Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
-once each and let them compete for the same cores.""",
+Frames are computed in turn: one process per camera would load the network several times and compete for the cores.""",
 }
 _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 """Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
@@ -70,7 +69,7 @@ synthetic_depth_node = partial(_run, "synthetic_depth_node")
 
 
 def recover_cameras(arguments: Sequence[str] | None = None) -> int:
-    """A recover_node for each camera of the command line."""
+    """Run one recover_node per camera on the command line."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     parser = _parser("recover_cameras", " CAMERA ...")
     parser.add_argument("cameras", nargs="+", metavar="CAMERA", type=_namespace, help="namespace of a camera")
@@ -95,12 +94,12 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
 
 
 def _before_ros(arguments: list[str]) -> list[str]:
-    """What is not for ROS."""
+    """Return the arguments that are not for ROS."""
     return arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
 
 
 def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
-    """Refuses what a program does not take; its help has the parameters with their defaults."""
+    """Make a parser that refuses unknown arguments; its help lists the parameters with their defaults."""
     kind = name.replace("recover_cameras", "recover_node")
     parameters = fast_dds.configuration_file(f"{kind}.yaml").read_text(encoding="utf-8")
     return argparse.ArgumentParser(
@@ -113,15 +112,15 @@ def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
 
 
 def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
-    """One of this package's nodes, by the name of its program."""
+    """Create one of this package's nodes by the name of its program."""
     if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 
-        return process.made(GraspNode, name)
+        return process.make(GraspNode, name)
     if name == "synthetic_depth_node":
         from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
 
-        return process.made(SyntheticDepthNode, name)
+        return process.make(SyntheticDepthNode, name)
     from sq_msgs_py.transforms import prefix_in
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
@@ -129,7 +128,7 @@ def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
     parameters = FitterParameters if name == "fitter_node" else RecoverParameters
     # Bodies of two cameras must not have one name.
     own = {} if namespace is None else {"tf_prefix": prefix_in(namespace)}
-    return process.made(FrameNode, name, parameters, namespace=namespace, defaults=own)
+    return process.make(FrameNode, name, parameters, namespace=namespace, defaults=own)
 
 
 def _namespace(text: str) -> str:

@@ -1,13 +1,13 @@
-"""Fast DDS: the profile that keeps large images from getting lost, and the shared memory that killed processes leave.
+"""Fast DDS: the profile that prevents the loss of large images, and the shared memory that killed processes leave.
 
-Fast DDS 2, that of Jazzy, reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so
-that the variable must be set before rclpy.init.  A file that the user has chosen is left alone.  Its successor's name,
-FASTDDS_DEFAULT_PROFILES_FILE, means nothing to it.
+Fast DDS 2 of Jazzy reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so the
+variable must be set before rclpy.init.  A user's file is kept.  It ignores its successor's variable,
+FASTDDS_DEFAULT_PROFILES_FILE.
 
 It keeps one segment per participant in /dev/shm, ``fastrtps_<16 hex digits>``, 17 MB with this profile, whose owner
-holds a lock on ``fastrtps_<16 hex digits>_el`` for as long as it lives.  After kill -9 the kernel frees the lock, but
-nothing frees the segment (docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test that ``fastdds shm
-clean`` applies; as these are files of the middleware's, nodes call it only with ``free_shared_memory``.
+holds a lock on ``fastrtps_<16 hex digits>_el`` while it lives.  After kill -9 the kernel frees the lock, but nothing
+frees the segment (docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test of ``fastdds shm clean``;
+since they belong to the middleware, nodes call it only with ``free_shared_memory``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LOCK = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
 
 
 def configuration_file(name: str) -> Path:
-    """A shipped file: beside the package's modules where it is installed, in ``config/`` of a source tree."""
+    """Return a shipped file: beside the modules if installed, in ``config/`` of a source tree."""
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "config", package.parent / "config"):
         if (folder / name).is_file():
@@ -36,17 +36,17 @@ def configuration_file(name: str) -> Path:
 
 
 def profile_path() -> Path:
-    """The shipped profile."""
+    """Return the path of the shipped profile."""
     return configuration_file(_FILE)
 
 
 def additions() -> dict[str, str]:
-    """What the environment lacks: the variable of the shipped profile, or nothing if it names one."""
+    """Return what to add to the environment: the variable of the shipped profile, or nothing if a profile is set."""
     return {} if os.environ.get(VARIABLE) else {VARIABLE: str(profile_path())}
 
 
 def remove_orphans(folder: Path = FOLDER) -> tuple[str, ...]:
-    """Delete this user's segments of dead owners that are older than :data:`LEAST_AGE`; their names.
+    """Delete this user's segments of dead owners older than :data:`LEAST_AGE`; return their names.
 
     What cannot be read or removed stays, and nothing is raised for it.  Ports (``fastrtps_port<number>``) stay too:
     they are few, small, and taken over by the next process with the same number.
@@ -56,10 +56,10 @@ def remove_orphans(folder: Path = FOLDER) -> tuple[str, ...]:
     except OSError:
         return ()
     found = (match for match in map(_LOCK.fullmatch, names) if match is not None)
-    return tuple(match[1] for match in found if _removed(folder / match[0], folder / match[1]))
+    return tuple(match[1] for match in found if _remove(folder / match[0], folder / match[1]))
 
 
-def _removed(lock: Path, segment: Path) -> bool:
+def _remove(lock: Path, segment: Path) -> bool:
     try:
         descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:

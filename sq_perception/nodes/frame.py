@@ -1,7 +1,7 @@
-"""A depth image on its way through a node: decoded from its message, and back into messages like it.
+"""Decoding of depth image messages, and encoding of depth as messages of the same kind.
 
-The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``; how such messages are
-listened to is here too.
+The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``; their quality of
+service is here too.
 """
 
 from __future__ import annotations
@@ -16,14 +16,17 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message
-from sq_msgs_py.points import points_from_message
+from sq_msgs_py.points import labels_of_points, points_from_message
+from sq_perception.geometry.rotation import to_matrix
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.parameters import POINTS, RAW
 from sq_perception.recordings import cloud_file, publication
+from sq_perception.recordings.cloud_frame import moved
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
@@ -31,21 +34,21 @@ _DIGITS = 3
 
 
 def newest() -> QoSProfile:
-    """Quality of service for images: the newest alone, as with a queue a slow subscriber would answer old ones.
+    """Return the quality of service of images: keep only the newest, as a queue would delay slow subscribers.
 
     Made anew each time, as rclpy writes overrides into it.
     """
     return QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
 
 
-def latched() -> QoSProfile:
-    """Quality of service for what stays true: who subscribes later gets the last message.  Made anew, likewise."""
+def latched_qos() -> QoSProfile:
+    """Return the quality of service of persistent messages: later subscribers get the last one."""
     return QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A depth image that is fit to be processed.
+    """A depth image that is ready to be processed.
 
     ``depth`` (height, width) is float32, metres in the optical frame, NaN where nothing was measured, rectified as the
     int32 ``labels`` are; ``encoding`` is that of the message before it was packed.  ``has_free_space``: whether a
@@ -63,31 +66,35 @@ class Frame:
 
     @property
     def camera(self) -> Camera:
-        """The pinhole or orthographic camera of the depth."""
+        """The camera of the depth image, pinhole or orthographic."""
         return self.calibration.camera
 
     @property
     def is_cube(self) -> bool:
-        """Whether results belong in the cube frame."""
+        """Whether results are in the cube frame."""
         return not self.camera.is_pinhole
 
     def with_mask(self, message: Image) -> Frame:
-        """The frame with the label image of its objects.  Raises ValueError for one of another size or kind."""
+        """Return the frame with a label image of its objects.  Raises ValueError for a wrong size or encoding."""
         labels = labels_from_message(message)
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
             raise ValueError(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
-        return replace(self, labels=self.calibration.rectified_labels(labels))
+        return replace(self, labels=self.calibration.rectify_labels(labels))
 
     def encode(self, depth: np.ndarray) -> Image:
-        """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
+        """Encode another depth image (height, width), NaN or inf for no reading, as a message like the frame's own."""
         return publication.depth_message(self.calibration.as_sent(depth), self.header, self.encoding)
 
 
 def decode(
-    message: DepthMessage, calibration_of: Callable[[], Calibration] | None, scale: float | None = None, kind: str = "z"
+    message: DepthMessage,
+    calibration_of: Callable[[], Calibration] | None,
+    scale: float | None = None,
+    kind: str = "z",
+    view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Frame:
-    """The frame of a depth image message; raises ValueError for anything that keeps it from being processed.
+    """Decode a depth image message; raises ValueError for anything that prevents its processing.
 
     Parameters
     ----------
@@ -99,40 +106,47 @@ def decode(
         asked for clouds.
     scale, kind
         Units a metre, None: by the encoding; and whether the image holds "z" or "range".
+    view
+        The camera's optical frame and the pose, quaternion and translation, of the points in it; None: they are in it.
     """
     if isinstance(message, PointCloud2):
-        points = points_from_message(message) / np.float32(scale or 1.0)
+        header, points = message.header, points_from_message(message) / np.float32(scale or 1.0)
+        if view is not None:
+            frame_id, (turn, shift) = view
+            header, points = Header(stamp=header.stamp, frame_id=frame_id), moved(points, to_matrix(turn), shift)
         try:
-            depth, seen, is_image = cloud_file.as_image(points)
+            labels = labels_of_points(message, cloud_file.LABEL_FIELDS)
+            found = cloud_file.as_image(points, None if labels is None else cloud_file.labels_of(labels))
         except ValueError as error:
-            raise ValueError(f"points in {message.header.frame_id or 'a frame without a name'}: {error}") from error
-        numbers = {name: round(getattr(seen, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
-        calibration = Calibration(replace(seen, **numbers))
-        return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)
+            raise ValueError(f"points in {header.frame_id or 'a frame without a name'}: {error}") from error
+        numbers = {name: round(getattr(found.camera, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
+        notes = () if labels is None else (cloud_file.LABELLED,)
+        calibration = Calibration(replace(found.camera, **numbers))
+        return Frame(header, "32FC1", found.depth, calibration, found.labels, found.is_image, notes)
     if calibration_of is None:
         if message.encoding in DEPTH_ENCODINGS:
             raise ValueError(
                 f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
                 "metric depth images of a camera need projection = pinhole"
             )
-        found, encoding = publication.depth_of(message, is_cube=True)
-        height, width = found.depth.shape
-        return Frame(message.header, encoding, found.depth, Calibration(unit_cube.camera(width, height)))
+        image, encoding = publication.depth_of(message, is_cube=True)
+        height, width = image.depth.shape
+        return Frame(message.header, encoding, image.depth, Calibration(unit_cube.camera(width, height)))
     if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
         raise ValueError(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )
-    found, encoding = publication.depth_of(message, False, scale)
+    image, encoding = publication.depth_of(message, False, scale)
     calibration = calibration_of()
-    depth = calibration.rectified(found.depth)
+    depth = calibration.rectify(image.depth)
     if kind == "range":
         depth = depth_units.z_from_range(depth, calibration.camera)
-    return Frame(message.header, encoding, depth, calibration, notes=found.notes)
+    return Frame(message.header, encoding, depth, calibration, notes=image.notes)
 
 
 def image_topic(node: Node, transport: str) -> str:
-    """The topic to listen to for depth images, with the node's namespace and remappings.
+    """Return the topic of depth images, with the node's namespace and remappings.
 
     The transport's part comes behind the remapped ``depth/image``, unless that names it already.  Points have a topic
     of their own, ``depth/points``, which is remapped by itself.
@@ -146,7 +160,7 @@ def image_topic(node: Node, transport: str) -> str:
 
 
 def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInfo], None]) -> Subscription | None:
-    """Subscribe to a camera_info that was published once and is kept for late comers, if somebody offers one now.
+    """Subscribe to a camera_info that is latched, if a publisher offers one.
 
     Not without looking: a driver that keeps nothing would log an incompatible subscription.
     """
@@ -155,9 +169,9 @@ def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInf
         return None
     # Others on the topic may keep nothing; a plain subscription hears them.
     quietly = SubscriptionEventCallbacks(incompatible_qos=lambda _: None)
-    return node.create_subscription(CameraInfo, topic, callback, latched(), event_callbacks=quietly)
+    return node.create_subscription(CameraInfo, topic, callback, latched_qos(), event_callbacks=quietly)
 
 
 def stamp_of(message: Any) -> int:
-    """Nanoseconds of a message's header.  Not by rclpy's Time, which refuses stamps before 1970."""
+    """Return the nanoseconds of a message's header.  Not by rclpy's Time, which refuses stamps before 1970."""
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)

@@ -1,15 +1,15 @@
-"""The node behind recover_node and fitter_node: depth images in, superquadrics out; its topics are in README.md.
+"""The node behind recover_node and fitter_node: depth images in, superquadrics out; its topics are in docs/nodes.md.
 
-The way of an image, each room entered once:
+The stages of an image:
 
     input.Input -> frame.decode -> engine.Engine.recover -> tracking.Tracking.identify -> outputs.Outputs.answer
 
-The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
-parameters answer at once.  Every output has the stamp of the input.  Results of orthographic frames are in the cube
-frame of :mod:`sq_perception.imaging.unit_cube`, others in the optical frame or ``target_frame``.
+The executor's thread only stores messages; one worker thread processes the newest, so that services and parameters
+respond at once.  Every output has the stamp of the input.  Results of orthographic frames are in the cube frame of
+:mod:`sq_perception.imaging.unit_cube`, others in the optical frame or ``target_frame``.
 
 A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
-subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
+subscribes, deactivating unsubscribes after the current frame, cleaning up frees the network's memory.
 """
 
 from __future__ import annotations
@@ -30,17 +30,20 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py import answers
+from sq_perception.geometry import kernel_cache
 from sq_perception.imaging import unit_cube
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
+from sq_perception.nodes.interfaces import RecoverInterfaces
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
+from sq_perception.nodes.tracking import Pose as CameraPose
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
@@ -66,7 +69,7 @@ class Outcome(NamedTuple):
 
 
 class FrameNode(ManagedNode):
-    """See the module; ``kind`` is the dataclass of its parameters, ``defaults`` are in place of some of its own.
+    """Node for depth images; ``kind`` is its parameter dataclass, ``defaults`` override some of its defaults.
 
     Raises
     ------
@@ -112,6 +115,7 @@ class FrameNode(ManagedNode):
         apart = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
+        self._interfaces = RecoverInterfaces(self, self._next_outcome, apart)
         self.create_timer(1.0, self._on_second, clock=_STEADY)
         self.start(self._settings.current.autostart)
 
@@ -124,6 +128,7 @@ class FrameNode(ManagedNode):
             self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
+        kernel_cache.compile_beside()
         self._engine.build(parameters)
         association.warm_up()
         latest = self._settings.current
@@ -133,7 +138,7 @@ class FrameNode(ManagedNode):
         self._engine.follow(latest, frozenset(meanwhile))
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
         self._outputs.open(latest)
-        if latest.fixed_frame or latest.target_frame:
+        if latest.fixed_frame or latest.target_frame or latest.camera_frame:
             self._poses.listen()
         process.keep_objects()
 
@@ -159,7 +164,7 @@ class FrameNode(ManagedNode):
         process.release_objects()  # nothing of a network may hang on in a cycle of references
 
     def _stop(self) -> None:
-        """End subscriptions and worker.  What planners know stays: a camera that fails takes no obstacles."""
+        """End subscriptions and worker.  Planners keep their obstacles when a camera fails."""
         with self._publishing:
             source, self._input = self._input, None
         if source is not None:
@@ -168,15 +173,20 @@ class FrameNode(ManagedNode):
         if self._worker is not None:
             self._worker.join(_WORKER_END)
             if self._worker.is_alive():
-                self.get_logger().warning("the frame at hand takes long; it is the last one, and is not published")
+                self.get_logger().warning("the current frame takes long; it is the last one and is not published")
 
     def close(self) -> bool:
-        """As :meth:`ManagedNode.close`; False also while a frame or a swap of the model is still at work."""
+        """Close as :meth:`ManagedNode.close`; also False while a frame or a model change is in progress."""
         is_still = super().close()
         return is_still and not self._engine.is_making and (self._worker is None or not self._worker.is_alive())
 
+    def destroy_node(self) -> None:
+        """As rclpy's, with the action."""
+        self._interfaces.close()
+        super().destroy_node()
+
     def _why_locked(self) -> str:
-        """Why parameters that are read at the configuration cannot change now; empty if they can."""
+        """Return why parameters that are read at configuration cannot change now; empty if they can."""
         if not self.is_configured:
             return ""
         name = self.get_fully_qualified_name()
@@ -195,11 +205,11 @@ class FrameNode(ManagedNode):
                 with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
-                    found = self._recovered(source, arrival) if arrival is not None and self._is_wanted() else None
+                    found = self._recover(source, arrival) if arrival is not None and self._is_wanted() else None
                 with self._publishing:
                     # Deactivated or disabled meanwhile: nothing is published.
                     if arrival and found and self._input is source and self._is_wanted():
-                        outcome = self._published(arrival, *found)
+                        outcome = self._publish(arrival, *found)
                         self._defects = 0
             except ValueError as error:
                 outcome = Outcome(False, str(error))
@@ -213,7 +223,7 @@ class FrameNode(ManagedNode):
                 self._conclude(arrival, outcome)
 
     def _conclude(self, arrival: Arrival, outcome: Outcome | None) -> None:
-        """Count a frame by its outcome, None where it was dropped, and answer who waits for one."""
+        """Count a frame by its outcome, None if it was dropped, and answer whoever waits for one."""
         was_wanted = self._is_wanted()
         if outcome is None:
             self._statistics.count("dropped")
@@ -227,44 +237,54 @@ class FrameNode(ManagedNode):
                 self._outputs.hide()
 
     def _is_wanted(self) -> bool:
-        """Whether frames are processed, or one is asked for."""
+        """Return whether frames are processed or one was requested."""
         return self._enabled or any(not trigger.done() for trigger in tuple(self._triggers))
 
-    def _recovered(self, source: Input, arrival: Arrival) -> tuple[Frame, Answer, dict[str, float]]:
-        """The frame of an image, its bodies, and how long that took by stage, milliseconds."""
+    def _recover(self, source: Input, arrival: Arrival) -> tuple[Frame, Answer, dict[str, float]]:
+        """Return the frame of an image, its bodies, and the duration of each stage in milliseconds."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
+        self._poses.follow(stamp_of(arrival.message))
+        view: tuple[str, CameraPose] | None = None
+        if parameters.camera_frame:
+            view = parameters.camera_frame, self._found_pose(arrival.message.header, parameters, "camera_frame")
         with timed(stages, "decode"):
-            frame = source.frame(arrival, parameters)
-        self._poses.follow(stamp_of(frame))
+            frame = source.frame(arrival, parameters, view)
         answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages
 
     def _pose_of(self, frame: Frame, parameters: RecoverParameters) -> Pose | None:
-        """Where the optical frame is in that of the results, if that is another one and the workspace is there.
+        """Return the pose of the optical frame in the frame of the results, if these differ and the workspace needs it.
 
-        ValueError if it is not known.  A transform that has not come yet is waited for while other cameras compute.
+        ValueError if it is not known.
         """
         if frame.is_cube:
             return unit_cube.POSE
         if not parameters.target_frame or parameters.box is None:
             return None
-        asked = self._poses, frame.header, parameters.target_frame
-        try:
-            turn, shift = pose_in(*asked, 0.0)
-        except ValueError:
-            with TURNS.pause():
-                turn, shift = pose_in(*asked, parameters.tf_tolerance)
+        turn, shift = self._found_pose(frame.header, parameters, "target_frame")
         return tuple(turn.tolist()), tuple(shift.tolist())
 
-    def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
-        """Name the bodies and publish them; None where that is not wanted any more."""
+    def _found_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
+        """The pose of a header's frame in that of the parameter ``name``; ValueError if it is not known.
+
+        A transform that has not come yet is waited for while other cameras compute.
+        """
+        frame = getattr(parameters, name)
+        try:
+            return pose_in(self._poses, header, frame, 0.0, name)
+        except ValueError:
+            with TURNS.pause():
+                return pose_in(self._poses, header, frame, parameters.tf_tolerance, name)
+
+    def _publish(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
+        """Name and publish the bodies; None if they are no longer wanted."""
         parameters = self._settings.current
         with timed(stages, "tracking"):
             found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
-            shown = self._outputs.shown(found, frame, parameters)
+            shown = self._outputs.shown_bodies(found, frame, parameters)
             # Both may have waited for transforms.  Disabled meanwhile: least of all a grasped body is published.
             if not self._is_wanted():
                 return None
@@ -282,7 +302,7 @@ class FrameNode(ManagedNode):
         return Outcome(True, summary, shown)
 
     def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:
-        """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""
+        """Answer requests that were waiting when the frame arrived, at ``arrived`` of the monotonic clock."""
         for caller, since in tuple(self._triggers.items()):
             if since <= arrived and not caller.done():
                 caller.set_result(outcome)
@@ -290,7 +310,7 @@ class FrameNode(ManagedNode):
                     self.executor.wake()  # a future that is awaited does not do that itself
 
     def _note_defect(self, text: str) -> None:
-        """A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on."""
+        """Log a program error, which costs this frame only."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
         self._defects += 1
         if self._defects == _DEFECTS:
@@ -321,7 +341,7 @@ class FrameNode(ManagedNode):
         return response
 
     async def _next_outcome(self) -> Outcome:
-        """The outcome of the next frame, or why there is none."""
+        """Return the outcome of the next frame, or why there is none."""
         source = self._input
         if source is None:
             return Outcome(False, f"the node is {self.state}, not active")
@@ -357,7 +377,7 @@ class FrameNode(ManagedNode):
         self._diagnostics.publish(self._statistics.report(self, self._standing(silent), more))
 
     def _standing(self, silent: bool) -> Standing | None:
-        """The level and message of diagnostics that do not depend on frames, if any."""
+        """Return the level and message of diagnostics that do not depend on frames, if any."""
         if (standing := self.standing(self._engine.fault)) is not None:
             return standing
         if not self._enabled:

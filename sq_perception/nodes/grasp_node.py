@@ -1,16 +1,15 @@
 """grasp_node: superquadrics in, grasps of a parallel gripper out; its topics are in docs/grasping.md.
 
-All outputs have the header of the cloud.  The last plane in its frame counts, also where a camera has moved with that
-frame since; without one, grippers come from the side of the frame's origin: of the camera, or of ``target_frame``.
-What no message holds, measured points and unseen space, is not looked at; the command ``sq-perception grasp`` does.
-Correlations of a body's numbers are not in the cloud either.  Nor is it told from the cloud whether it is in metres:
-one in the frame ``unit_cube`` is refused, no other one of orthographic images.
+All outputs have the header of the cloud.  The last plane in its frame is used, even if the camera has moved with that
+frame since; without a plane, grippers approach from the side of the frame's origin: the camera, or ``target_frame``.
+Measured points, unseen space and correlations are in no message and so ignored, unlike in ``sq-perception grasp``.  The
+cloud does not say whether it is in metres: of clouds from orthographic images, only the frame ``unit_cube`` is refused.
 
-``~/plan`` and ``~/plan_grasps`` plan the last cloud again, unless it is older than ``max_age``: where a camera has
+``~/plan`` and ``~/plan_grasps`` plan on the last cloud again, unless it is older than ``max_age``: if the camera has
 stopped, the bodies may be gone.
 
-Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
-target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.
+If moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp for the body whose
+collision object is the target's id, or for all bodies without an id.  Other fields of the request are ignored.
 """
 
 from __future__ import annotations
@@ -31,6 +30,7 @@ from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import answers, transforms
 from sq_msgs_py import grasps as messages
+from sq_msgs_py.interfaces import grasp_array
 from sq_msgs_py.markers import Mesh, markers
 from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_of
@@ -39,7 +39,8 @@ from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.nodes.frame import latched, stamp_of
+from sq_perception.nodes.frame import latched_qos, stamp_of
+from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
@@ -54,7 +55,7 @@ _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
 
 
 class GraspNode(ManagedNode):
-    """See the module."""
+    """Node that plans grasps; see the module."""
 
     def __init__(self, name: str, *, context: Any = None) -> None:
         super().__init__(name, context=context)
@@ -68,19 +69,21 @@ class GraspNode(ManagedNode):
         self._marker_ids = MarkerIds()
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
+        self._array: Publisher | None = None
         self._publishing = threading.Lock()
         """Held while something is published, or nothing is any more."""
         self._clouds: Listener | None = None
         self._planes: Any = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/plan", self._on_plan)
+        optional(self, self.create_service, "sq_msgs/srv/PlanGrasps", "~/plan_array", self._on_plan_array)
         with suppress(ImportError):
             self.create_service(installed("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.start(self._settings.current.autostart)
 
     def _configure(self) -> None:
-        """Compile or load the kernels, so that no first cloud waits."""
+        """Compile or load the kernels, so that the first cloud does not wait."""
         warm_up()
 
     def _activate(self) -> None:
@@ -90,7 +93,8 @@ class GraspNode(ManagedNode):
             self.create_publisher(PointCloud2, "~/grasp_details", 10),
             self.create_publisher(MarkerArray, "~/markers", 10),
         ]
-        self._planes = self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched())
+        self._array = optional(self, self.create_publisher, "sq_msgs/msg/GraspArray", "~/grasp_array", 10)
+        self._planes = self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched_qos())
         self._heard_at = monotonic()
         self._clouds = Listener(self, PointCloud2, "superquadrics", self._on_cloud, self._statistics)
         self.get_logger().info(f"ready, listening to {self._clouds.topic}")
@@ -105,9 +109,9 @@ class GraspNode(ManagedNode):
                 shown = self._outputs[-1]
                 shown.publish(self._markers([], [], self._last.header))
                 shown.wait_for_all_acked(ARRIVAL)
-            for publisher in self._outputs:
+            for publisher in (*self._outputs, *([] if self._array is None else [self._array])):
                 self.destroy_publisher(publisher)
-            self._outputs = []
+            self._outputs, self._array = [], None
 
     def _cleanup(self) -> None:
         self._deactivate()
@@ -120,7 +124,7 @@ class GraspNode(ManagedNode):
         self._statistics.count("received")
         stages: dict[str, float] = {}
         with timed(stages, "plan"):
-            found, text = self._answered(message)
+            found, text = self._answer(message)
         if found is not None:
             self._statistics.answer(stages, text)
         elif self._clouds is None:
@@ -132,7 +136,8 @@ class GraspNode(ManagedNode):
         return 1e-9 * self.get_clock().now().nanoseconds
 
     def _age(self, cloud: PointCloud2) -> float:
-        """Seconds since the image of the last cloud; since the cloud came where its stamp is of another clock."""
+        """Return the seconds since the stamp of the last cloud, or since its arrival if the stamp is of another
+        clock."""
         now, stamp = self._now(), 1e-9 * stamp_of(cloud)
         since = max(now - self._arrival, 0.0)
         return max(now - stamp, since) if stamp and now - stamp < OLDEST else since
@@ -152,16 +157,23 @@ class GraspNode(ManagedNode):
 
     def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         cloud = self._last
-        found, response.message = self._planned_again(cloud)
+        found, response.message = self._plan_again(cloud)
         if found and cloud:
             response.success = True
             response.message = answers.text_of(found, cloud.header, response.message)
         return response
 
+    def _on_plan_array(self, request: Any, response: Any) -> Any:
+        cloud = self._last
+        found, response.message = self._plan_again(cloud)
+        if found and cloud:
+            response.success, response.grasps = True, grasp_array(found, cloud.header)
+        return response
+
     def _on_plan_grasps(self, request: Any, response: Any) -> Any:
         code, target, cloud = response.error_code, request.target.id, self._last
         code.source = self.get_fully_qualified_name()
-        found, code.message = self._planned_again(cloud)
+        found, code.message = self._plan_again(cloud)
         if found is None or cloud is None:
             code.val = code.FAILURE
             return response
@@ -180,41 +192,41 @@ class GraspNode(ManagedNode):
         code.val = code.SUCCESS if response.grasps else code.PLANNING_FAILED
         return response
 
-    def _planned_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
+    def _plan_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
         if not self.is_active or cloud is None:
             return None, "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
         age, limit = self._age(cloud), self._settings.current.max_age
         if 0 < limit < age:
             return None, f"the last superquadrics are {age:.1f} s old, and max_age is {limit:g} s"
-        found, text = self._answered(cloud)
+        found, text = self._answer(cloud)
         return found, f"{text}; {age:.1f} s old"
 
     def _plane_in(self, header: Any) -> np.ndarray | None:
-        """The last plane, where it is in the frame of that header."""
+        """Return the last plane if it is in the frame of this header."""
         plane = self._plane
         return plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
 
-    def _answered(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
-        """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
+    def _answer(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
+        """Plan and publish; return the grasps and why bodies have none.  No message ends the node."""
         try:
             if message.header.frame_id == CUBE_FRAME:
                 raise ValueError("views of the unit cube have no metres to grasp in")
             bodies = from_message(message).recovered
-            plan = planned(bodies, self._settings.current, self._plane_in(message.header))
+            planned = plan(bodies, self._settings.current, self._plane_in(message.header))
             with self._publishing:
                 if not self._outputs:  # deactivated while it was planned
                     return None, f"the node is {self.state}"
-                found = self._published(message.header, bodies, plan, gripper(self._settings.current.gripper))
+                found = self._publish(message.header, bodies, planned, gripper(self._settings.current.gripper))
         except Exception as error:
             reason = f"refused superquadrics: {type(error).__name__}: {error}"
             self.get_logger().warning(reason, throttle_duration_sec=THROTTLE)
             return None, reason
-        reasons = [f"{number}: {why}" for number, why in zip(bodies.id, plan.reasons, strict=True) if why]
+        reasons = [f"{number}: {why}" for number, why in zip(bodies.id, planned.reasons, strict=True) if why]
         if len(bodies) and not (reasons or len(found)):
             reasons = ["only_id and region leave none"]
         return found, "; ".join([f"{len(found)} grasps of {len(bodies)} bodies", *reasons])
 
-    def _published(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:
+    def _publish(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:
         found = messages.GraspArray(
             **{name: np.array([getattr(grasp, name) for grasp in plan.grasps]) for name in _OF_EACH_GRASP},
             id=np.array([bodies.id[grasp.body] for grasp in plan.grasps]),
@@ -222,21 +234,23 @@ class GraspNode(ManagedNode):
         poses, details, shown = self._outputs
         poses.publish(messages.poses(found, header))
         details.publish(messages.to_message(found, header))
+        if self._array is not None:
+            self._array.publish(grasp_array(found, header))
         best = {int(bodies.id[grasp.body]): grasp for grasp in reversed(plan.grasps)}
         meshes = []
         for grasp in best.values():
             vertices, faces, edges = hand.mesh(grasp.opening)
-            meshes.append((grasp.placed(vertices), faces, grasp.placed(edges)))
+            meshes.append((grasp.to_body_frame(vertices), faces, grasp.to_body_frame(edges)))
         shown.publish(self._markers(meshes, list(best), header))
         return found
 
     def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
-        """Markers of grasps, by their bodies' ids, which replace the markers before."""
-        return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replaced(ids))
+        """Return markers of grasps with their bodies' ids, which replace the earlier ones."""
+        return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replace_markers(ids))
 
 
-def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
-    """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
+def plan(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
+    """Plan grasps as the parameters say; excluded bodies are obstacles without grasps."""
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement
     plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)

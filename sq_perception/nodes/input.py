@@ -1,10 +1,10 @@
-"""The input of a frame node: what it hears, what waits for the worker, and the frames that are made of it.
+"""The input of a frame node: its subscriptions, the images that wait for the worker, and their frames.
 
-Callbacks of the executor store, one worker thread takes; the newest complete depth image wins.  It is complete with the
-camera_info of its own stamp, or else the latest one of its size, and, where masks are expected, with the mask of its
-own stamp.  What is missing may come within ``patience`` seconds, in which newer images come too: nobody who has the
-turn to compute waits for a message, and a frame has its mask though the network that makes it is slower than the
-camera.  As soon as an image is complete, or its patience is at an end, it takes the place of every older one.
+Callbacks of the executor store messages; one worker thread takes the newest complete depth image.  An image is complete
+with the camera_info of its stamp, or else the latest of its size, and, if masks are expected, with the mask of its
+stamp.  It waits ``patience`` seconds for them, while newer images arrive: no computation waits for a message, and a
+frame gets its mask even if the network that makes it is slower than the camera.  Once an image is complete, or its
+patience has expired, it replaces every older one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
-from sq_perception.recordings.cloud_file import UNORGANISED
+from sq_perception.nodes.tracking import Pose
+from sq_perception.recordings.cloud_file import LABEL_FIELDS, UNORGANISED
 from sq_perception.recordings.publication import size_of
 
 _INFOS = 16
@@ -45,7 +46,7 @@ instead it would be again and again, and a camera that sends so many within ``pa
 
 @dataclass(frozen=True)
 class Arrival:
-    """A depth image and what came with it.
+    """A depth image with its camera_info and mask.
 
     Its size is None for what is no image, which is to be refused at once.  It came at a time and waits for its
     companions until a deadline, seconds of the monotonic clock.
@@ -68,7 +69,7 @@ class _Info:
 
 
 class Input:
-    """The subscriptions of an active node, and what came.
+    """The subscriptions of an active node and their messages.
 
     An image that comes while none ``is_wanted`` is dropped at once.
     """
@@ -108,7 +109,7 @@ class Input:
         self._image = Listener(node, kind, self.topic, self._on_image, statistics)
 
     def follow_publishers(self) -> None:
-        """Hear publishers as they offer, and a camera_info that was published once before; called each second."""
+        """Adapt to the publishers and to a latched camera_info; called each second."""
         for listener in self._listeners:
             listener.follow()
         if self._info is not None and self._latched is None and not self._is_closed:
@@ -120,16 +121,16 @@ class Input:
 
     @property
     def silence(self) -> float:
-        """Seconds since the last depth image."""
+        """Return the seconds since the last depth image."""
         return monotonic() - self._last_image
 
     @property
     def heard(self) -> str:
-        """Who publishes depth images, and whether they can be heard."""
+        """Describe who publishes depth images, and whether they can be received."""
         return self._image.publishers
 
     def close(self) -> None:
-        """Listen no more, and let the worker go; what waits is dropped."""
+        """Stop listening and release the worker; drop what waits."""
         with self._changed:
             self._is_closed = True
             left = len(self._waiting) + (self._ready is not None)
@@ -157,7 +158,7 @@ class Input:
             return False
 
     def take(self) -> Arrival | None:
-        """The image that :meth:`wait` waited for, or a newer one; None if there is none."""
+        """Return the image that :meth:`wait` waited for, or a newer one; None if there is none."""
         with self._changed:
             self._promote(monotonic())
             arrival, self._ready = self._ready, None
@@ -165,8 +166,10 @@ class Input:
                 arrival = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
             return arrival
 
-    def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:
-        """The frame of an image with what belongs to it.
+    def frame(
+        self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None
+    ) -> Frame:
+        """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.
 
         Raises
         ------
@@ -179,16 +182,19 @@ class Input:
             None if source is None else lambda: self._calibration_of(message, source),
             parameters.depth_scale or None,
             parameters.depth_kind,
+            view,
         )
+        if use == "never" and frame.labels is not None:
+            frame = replace(frame, labels=None)
         if frame.notes and frame.notes != self._numbers_note:
             self._numbers_note = frame.notes
             self._node.get_logger().info(f"{self.topic}: {'; '.join(frame.notes)}", throttle_duration_sec=THROTTLE)
         if not frame.has_free_space:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
-            if use == "always":
+            if use == "always" and frame.labels is None:
                 raise ValueError("mask: expected an image or an organised cloud (use_masks is always), got another one")
             return frame  # whose pixels are those of no mask
-        if use == "always" and arrival.mask is None:
+        if use == "always" and arrival.mask is None and frame.labels is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
             raise ValueError(f"mask: {expected}, none came on {self._mask.topic}")
         if use == "auto" and arrival.needs_mask and arrival.mask is None:
@@ -231,7 +237,10 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
-        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+        has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
+        needs_mask = not has_labels and (
+            use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+        )
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")
@@ -242,7 +251,7 @@ class Input:
             self._promote(now)
 
     def _on_info(self, message: CameraInfo) -> None:
-        """Keep a camera_info; a useless one is kept as the reason for refusing frames of its size."""
+        """Store a camera_info; an invalid one is stored as the reason for refusing frames of its size."""
         size, calibration, fault = (int(message.width), int(message.height)), None, ""
         try:
             calibration = Calibration.of(message, self.topic, self._settings.current.distortion)
@@ -259,7 +268,7 @@ class Input:
             self._promote(monotonic())
 
     def _on_mask(self, message: Image) -> None:
-        """Keep a label image for the depth image of the same stamp; one without a stamp belongs to none."""
+        """Store a label image for the depth image with its stamp; ignore one without a stamp."""
         if stamp_of(message) == 0:
             return
         with self._changed:
@@ -271,7 +280,7 @@ class Input:
     # What waits, with the lock held
 
     def _promote(self, now: float) -> None:
-        """Make the newest image ready that is complete or has waited long enough; it takes the place of older ones."""
+        """Make the newest image ready that is complete or has waited long enough; it replaces older ones."""
         ready = [k for k, arrival in enumerate(self._waiting) if arrival.deadline <= now or self._is_complete(arrival)]
         if not ready and len(self._waiting) > _WAITING:
             ready = [0]
@@ -291,7 +300,7 @@ class Input:
         return has_info and (not arrival.needs_mask or stamp in self._masks)
 
     def _knows_camera(self, size: tuple[int, int], stamp: int) -> bool:
-        """Whether the camera_info of an image has come, or will say what those before it do.
+        """Return whether the camera_info of an image has arrived, or an earlier one will do.
 
         Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
         another one's would shift every body.

@@ -1,11 +1,11 @@
-"""A subscription that is as reliable as the publishers of its topic let it be, and that says whom it hears.
+"""A subscription that is as reliable as the publishers of its topic allow, and that lists the publishers.
 
-Keep last 1.  Best effort hears every publisher, but large messages that do not fit into the publisher's shared memory
-are lost: of VGA depth images, four in five.  A reliable subscription loses none, but does not hear a publisher that is
-best effort.  So a listener is reliable while all publishers of its topic are, and best effort otherwise; it looks again
-when one comes or goes.  DDS cannot change a live subscription: another one takes its place, and both listen while the
-publishers find it, so that no message is lost; one that both hear is passed on once.  Where
-``qos_overrides.<topic>.subscription.reliability`` is reliable or best_effort, that is kept.
+Keep last 1.  A best effort subscription receives every publisher, but loses large messages that do not fit into the
+publisher's shared memory: of VGA depth images, four in five.  A reliable subscription loses none, but receives no best
+effort publisher.  So a listener is reliable while all publishers of its topic are, and best effort otherwise; it checks
+again when one appears or leaves.  DDS cannot change a live subscription: a new one replaces it, and both listen until
+the publishers have found it, so that no message is lost; duplicates are passed on once.  If
+``qos_overrides.<topic>.subscription.reliability`` is reliable or best_effort, that takes precedence.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _REMEMBERED = 8
 
 
 class Listener:
-    """One subscription; ``statistics`` count what is lost.  Call :meth:`follow` each second.
+    """A subscription whose ``statistics`` count lost messages.  Call :meth:`follow` each second.
 
     Raises
     ------
@@ -66,16 +66,16 @@ class Listener:
         self._subscriptions: list[Subscription] = []
         """The present one last; before it one that it replaces."""
         with self._lock:
-            self._subscribe(self._wanted_reliability())
+            self._subscribe(self._choose_reliability())
 
     @property
     def qos(self) -> QoSProfile:
-        """Quality of service of the present subscription."""
+        """The quality of service of the current subscription."""
         return self._qos
 
     @property
     def publishers(self) -> str:
-        """Who publishes the topic, with which quality of service, and who of them cannot be heard."""
+        """Describe who publishes the topic, with which quality of service, and which of them cannot be received."""
         parts = []
         for publisher in self._node.get_publishers_info_by_topic(self.topic):
             offered = publisher.qos_profile
@@ -88,26 +88,26 @@ class Listener:
         return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"
 
     def follow(self) -> None:
-        """Subscribe as the publishers offer now, and end the subscription that was replaced some time ago."""
+        """Subscribe as the publishers now offer, and end a subscription that was replaced some time ago."""
         with self._lock:
             if len(self._subscriptions) > 1 and monotonic() - self._since > _OVERLAP:
                 self._node.destroy_subscription(self._subscriptions.pop(0))
         self._follow_publishers()
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
         with self._lock:
             for subscription in self._subscriptions:
                 self._node.destroy_subscription(subscription)
             self._subscriptions = []
 
     def _follow_publishers(self) -> None:
-        wanted = self._wanted_reliability()
+        wanted = self._choose_reliability()
         with self._lock:
             if len(self._subscriptions) == 1 and wanted != self._qos.reliability:
                 self._subscribe(wanted)
 
-    def _wanted_reliability(self) -> QoSReliabilityPolicy:
+    def _choose_reliability(self) -> QoSReliabilityPolicy:
         if self._asked is not None:
             return self._asked
         offered = {one.qos_profile.reliability for one in self._node.get_publishers_info_by_topic(self.topic)}
@@ -169,7 +169,7 @@ class Listener:
 
 
 def _reliability_override(node: Node, topic: str) -> QoSReliabilityPolicy | None:
-    """The user's choice for a topic.  Not by rclpy's own override, which does not tell it from the default."""
+    """Return the user's choice for a topic; rclpy's own override cannot be told from the default."""
     name = f"qos_overrides.{topic}.subscription.reliability"
     if not node.has_parameter(name):
         about = ParameterDescriptor(

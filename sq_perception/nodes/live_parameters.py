@@ -1,4 +1,4 @@
-"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, followed while the node runs.
+"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, updated at run time.
 
 Each field of such a dataclass is one parameter of the same name; :func:`setting` carries its descriptor:
 meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them
@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 
 
 class ParameterError(ValueError):
-    """A parameter that cannot be used; names it, what was expected and what arrived."""
+    """Error that names an invalid parameter, what was expected and what arrived."""
 
 
 def setting(
@@ -33,14 +33,14 @@ def setting(
     choices: tuple[str, ...] = (),
     live: bool = True,
 ) -> Any:
-    """A dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
+    """Return a dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
     about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
     return field(default=default, metadata=about)
 
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a node.  rclpy checks types and ranges, by the descriptors; what fits together is checked here.
+    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.
 
     Raises ParameterError for a value that is none of the choices, or does not fit the others.
     """
@@ -56,7 +56,7 @@ P = TypeVar("P", bound=Parameters)
 
 
 class LiveParameters(Generic[P]):
-    """Declares the fields of a dataclass ``kind`` as parameters of a node and follows their changes.
+    """Parameters of a node, declared from the fields of a dataclass ``kind``, with their changes.
 
     Parameters
     ----------
@@ -88,22 +88,22 @@ class LiveParameters(Generic[P]):
         self._kinds: dict[str, Any] = {parameter.name: type(parameter.default) for parameter in fields(kind)}
         self._fixed = {parameter.name for parameter in fields(kind) if not parameter.metadata["live"]}
         self._locked, self._check, self._changed, self._defaults = locked, check, changed, defaults
-        self.current: P = kind(**self._values([self._declared(node, parameter) for parameter in fields(kind)]))
+        self.current: P = kind(**self._values([self._declare(node, parameter) for parameter in fields(kind)]))
         """The values in force: an immutable set, replaced as a whole."""
-        node.add_pre_set_parameters_callback(lambda changes: [self._typed(change) for change in changes])
+        node.add_pre_set_parameters_callback(lambda changes: [self._cast(change) for change in changes])
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)
 
-    def _declared(self, node: Node, parameter: Field[Any]) -> Parameter:
+    def _declare(self, node: Node, parameter: Field[Any]) -> Parameter:
         # Of any type at first: declared as a double it would refuse an integer given at the start.
         default = self._defaults.get(parameter.name, parameter.default)
         node.declare_parameter(parameter.name, default, ParameterDescriptor(dynamic_typing=True))
-        given = self._typed(node.get_parameter(parameter.name))
+        given = self._cast(node.get_parameter(parameter.name))
         node.set_descriptor(parameter.name, describe(parameter, self._locked is None), given.get_parameter_value())
         return given
 
-    def _typed(self, given: Parameter) -> Parameter:
-        """A parameter with integers as doubles where it is one, or a list of them."""
+    def _cast(self, given: Parameter) -> Parameter:
+        """Return a parameter with integers as doubles where doubles, or a list of them, are declared."""
         kind = self._kinds.get(given.name)
         if kind is float and given.type_ == Parameter.Type.INTEGER:
             return Parameter(given.name, value=float(given.value))
@@ -112,7 +112,7 @@ class LiveParameters(Generic[P]):
         return given
 
     def _values(self, changes: list[Parameter]) -> dict[str, Any]:
-        """The values by name, without rclpy's own parameters, which another thread may declare."""
+        """Return the values by name, without rclpy's own parameters, which another thread may declare."""
         return {change.name: self._kinds[change.name](change.value) for change in changes if change.name in self._kinds}
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
@@ -137,7 +137,7 @@ class LiveParameters(Generic[P]):
 
 
 def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
-    """The descriptor of a field: its type, its text with the unit, its range or choices.
+    """Return the descriptor of a field: type, text with unit, range or choices.
 
     It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
     """

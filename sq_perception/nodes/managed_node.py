@@ -1,21 +1,20 @@
-"""A lifecycle node that brings itself up, does its transitions in a thread of its own, and reports why one failed.
+"""A lifecycle node that can start itself, runs its transitions in their own thread, and reports why one failed.
 
     unconfigured --configure--> inactive --activate--> active
          ^  ^---------cleanup------'  ^----deactivate----'
-         '---- errorprocessing <---- whatever raises in a transition, or a fault while active
+         '---- errorprocessing <---- an exception in a transition, or a fault while active
 
 Started by :meth:`ManagedNode.start` it configures and activates itself, so that plain ``ros2 run`` works without a
 manager.  A transition that takes seconds, such as loading a model, leaves the executor free: services answer meanwhile.
 
-What a subclass does in a transition it does in :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and
-:meth:`_cleanup`; any exception leads through ``errorprocessing``, where everything is released, to ``unconfigured``,
-from where the node can be configured again.  :attr:`fault` is the reason until it succeeds.  A fault while active
-(:meth:`_fail`) takes the same way; a node that started itself comes back after a pause, or ends its process if it
-cannot.
+A subclass implements :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and :meth:`_cleanup`; any exception
+leads through ``errorprocessing``, where everything is released, to ``unconfigured``, from where the node can be
+configured again.  :attr:`fault` is the reason until that succeeds.  A fault while active (:meth:`_fail`) does the same;
+a node that started itself restarts after a pause, or ends its process if it cannot.
 
 Transitions create and destroy publishers and subscriptions outside of the executor's thread.  rclpy's executors may
-raise InvalidHandle then (ros2/rclpy issue 1284), which :mod:`sq_perception.nodes.process` takes for nothing; a program
-with an executor of its own does the same.
+then raise InvalidHandle (ros2/rclpy issue 1284), which :mod:`sq_perception.nodes.process` ignores; programs with their
+own executor must do so too.
 
 Reference: https://design.ros2.org/articles/node_lifecycle.html
 """
@@ -54,7 +53,7 @@ _END = 4.0
 
 
 class ManagedNode(LifecycleNodeMixin, Node):
-    """See the module."""
+    """Lifecycle node that can start itself; see the module."""
 
     def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
         Node.__init__(self, name, namespace=namespace, context=context)
@@ -91,7 +90,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self.state not in ("unconfigured", "finalized", "unknown")
 
     def start(self, autostart: bool = True) -> None:
-        """Configure and activate, now and after a fault; :attr:`start_failure` has the reason of a failure.
+        """Configure and activate, now and after a fault; :attr:`start_failure` holds the reason of a failure.
 
         Without ``autostart`` only say that somebody else has to.
         """
@@ -105,7 +104,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._tasks.put(self._bring_up)
 
     def standing(self, fault: str = "") -> tuple[bytes, str] | None:
-        """Level and message for diagnostics of a node that is not active, or has a fault; None for one that works."""
+        """Return level and message for diagnostics of a node that is inactive or has a fault; None otherwise."""
         fault = self.fault or fault
         if self.is_active:
             return (DiagnosticStatus.WARN, fault) if fault else None
@@ -113,7 +112,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return level, f"{self.state}: {fault}" if fault else self.state
 
     def close(self) -> bool:
-        """Release everything; called once, before destroy_node.  False if a transition is still at work after a while.
+        """Release everything; called once, before destroy_node.  False if a transition does not end in time.
 
         The state becomes ``finalized`` where it was one that allows it.
         """
@@ -124,7 +123,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return not self._thread.is_alive()
 
     def destroy_node(self) -> None:
-        """Destroy the node as rclpy does, and the publisher of the transitions too.
+        """Destroy the node as rclpy does, and the publisher of the transitions.
 
         rclpy leaves that one to the garbage collector: it stayed in the graph for as long as the process lived.
         """
@@ -134,19 +133,19 @@ class ManagedNode(LifecycleNodeMixin, Node):
     # What a subclass does
 
     def _configure(self) -> None:
-        """Make ready what takes time or memory."""
+        """Prepare what takes time or memory."""
 
     def _activate(self) -> None:
-        """Begin to listen."""
+        """Start to listen."""
 
     def _deactivate(self) -> None:
-        """Stop to listen."""
+        """Stop listening."""
 
     def _cleanup(self) -> None:
-        """Release what :meth:`_configure` made, if anything, also after a part of it; stops what is active."""
+        """Release what :meth:`_configure` made, also after a partial configuration; stop what is active."""
 
     def _fail(self, reason: str) -> None:
-        """Leave the active state for a fault that further frames would only repeat; from any thread."""
+        """Leave the active state because of a fault that further frames would repeat; from any thread."""
         self._tasks.put(lambda: self._leave_by_fault(reason))
 
     # Transitions, all in one thread
@@ -169,7 +168,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self._attempt("shutdown", self._cleanup)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release everything, so that the node can be configured again; finalized where even that fails."""
+        """Release everything, so that the node can be configured again; finalized if that fails too."""
         fault = self.fault
         answer = self._attempt("release", self._cleanup)
         self.fault = fault
@@ -191,7 +190,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return TransitionCallbackReturn.SUCCESS
 
     def _change(self, name: str) -> bool:
-        """One transition by its name; False if the state does not allow it, or it failed."""
+        """Perform one transition by name; False if the state does not allow it or it failed."""
         before = self.state
         try:
             answer = getattr(self, f"trigger_{name}")()

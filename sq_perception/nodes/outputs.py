@@ -1,15 +1,15 @@
-"""What a frame node publishes of a frame's bodies: the point cloud, pictures, and what other stacks understand.
+"""The outputs of a frame node: point cloud, pictures, and messages for other stacks.
 
-The point cloud is the answer to a frame; what goes with it comes afterwards and cannot take the answer back.  Messages
-of tf2_msgs, vision_msgs and moveit_msgs are not on PyPI, and a robot may lack each: a package is imported only when its
-output is asked for, and one that is missing is named once in the log and stays in ``absent``.
+The point cloud is published first and does not depend on the other outputs.  tf2_msgs, vision_msgs and moveit_msgs are
+not on PyPI and may be missing on a robot: each is imported only when its output is enabled; a missing one is named once
+in the log and listed in ``absent``.
 
-/tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
-tf2_msgs alone, knows whether anybody listens, and can be taken down again.
+/tf is published like tf2_ros.TransformBroadcaster does, with the same queue of 100; our own publisher needs only
+tf2_msgs, knows its subscribers, and can be destroyed.
 
-The planning scene is sent again when another planner listens, and from time to time.  Switching it off removes all
-objects that were added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera
-fails; and what planners know outlives a restart after a fault, so that an object that is gone is still removed.
+The planning scene is sent again when another planner subscribes, and periodically.  Switching it off removes all added
+objects.  A node that exits removes nothing: a planner must not lose its obstacles because a camera fails.  The record
+of added objects survives a restart after a fault, so that vanished objects are still removed.
 """
 
 from __future__ import annotations
@@ -33,12 +33,14 @@ from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
+from sq_msgs_py.interfaces import superquadric_array
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_message
 from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import transforms
-from sq_perception.nodes.frame import Frame, latched
+from sq_perception.nodes.frame import Frame, latched_qos
+from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
@@ -59,7 +61,7 @@ _MOST_AGAIN = 32
 
 
 class MarkerIds:
-    """Ids of the markers that a listener may still show: those of the last message, and for a while those before.
+    """Ids of markers that a listener may still show: those of the last message, and for a while earlier ones.
 
     A listener that is busy loses messages, and a marker whose deletion was in a lost one would stay for good.
     """
@@ -68,8 +70,8 @@ class MarkerIds:
         self._until: dict[int, float] = {}
         """Until when they are deleted, in the order in which they went; endless while they are shown."""
 
-    def replaced(self, ids: Sequence[int]) -> list[int]:
-        """The ids whose markers the next message, which shows ``ids``, has to delete."""
+    def replace_markers(self, ids: Sequence[int]) -> list[int]:
+        """Return the ids whose markers the next message, which shows ``ids``, must delete."""
         now, shown = monotonic(), dict.fromkeys(ids, math.inf)
         gone = {number: until for number, until in self._until.items() if until >= now and number not in shown}
         again = dict([one for one in gone.items() if one[1] < math.inf][-_MOST_AGAIN:])
@@ -79,7 +81,7 @@ class MarkerIds:
 
 
 class Outputs:
-    """Publishes frames; used by one thread at a time.  ``poses`` know where the camera is in ``target_frame``."""
+    """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
 
     def __init__(self, node: Node, poses: CameraPoses) -> None:
         self._node, self._poses = node, poses
@@ -90,19 +92,21 @@ class Outputs:
         """Header of the markers that are shown, if there are any."""
 
     def open(self, parameters: RecoverParameters) -> None:
-        """Create what is published."""
+        """Create the publishers."""
         create = partial(
             self._node.create_publisher, qos_overriding_options=QoSOverridingOptions(policy_kinds=_OVERRIDABLE)
         )
         self.superquadrics = create(PointCloud2, "~/superquadrics", 10)
         self.markers = create(MarkerArray, "~/markers", 1)
         self.rendered_depth = create(Image, "~/rendered_depth", 1)
-        self.support_plane = create(PoseStamped, "~/support_plane", latched())
-        self._publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane
+        self.support_plane = create(PoseStamped, "~/support_plane", latched_qos())
+        self.array = optional(self._node, create, "sq_msgs/msg/SuperquadricArray", "~/superquadric_array", 10)
+        publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane, self.array
+        self._publishers = tuple(one for one in publishers if one is not None)
         self.optional.follow(parameters)
 
     def close(self) -> None:
-        """Destroy the publishers; what planners know stays with them, markers go."""
+        """Destroy the publishers and delete the markers; planners keep their objects."""
         if self._publishers:
             self.hide()
             self.markers.wait_for_all_acked(ARRIVAL)
@@ -112,13 +116,13 @@ class Outputs:
         self.optional.close()
 
     def hide(self) -> None:
-        """Delete the markers: nobody moves them from now on."""
+        """Delete the markers, since nothing updates them from now on."""
         if self._header is not None and self._node.context.ok():
             header, self._header = self._header, None
-            self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replaced(())))
+            self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replace_markers(())))
 
-    def shown(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
-        """What was found as every output shows it: in ``target_frame`` if there is one.
+    def shown_bodies(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
+        """Return the findings as every output shows them: in ``target_frame`` if there is one.
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
         """
@@ -129,8 +133,8 @@ class Outputs:
         """Publish plane and point cloud."""
         if not shown.header.frame_id:
             self._node.get_logger().warning(
-                "the images have no frame_id, and so have the results: RViz and tf2 cannot place them, and there are "
-                "no transforms or collision objects; the camera driver has to set it",
+                "the images have no frame_id: RViz and tf2 cannot place the results, and there are no transforms or "
+                "collision objects; the camera driver must set it",
                 throttle_duration_sec=THROTTLE,
             )
         if shown.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
@@ -140,13 +144,15 @@ class Outputs:
     def accompany(
         self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters, stages: dict[str, float]
     ) -> None:
-        """Publish what goes with the answer, and note the time of each stage.  What goes wrong is logged, no more."""
+        """Publish the other outputs and note the time of each stage.  Errors are only logged."""
         try:
+            if self.array is not None and self.array.get_subscription_count():
+                self.array.publish(superquadric_array(shown.array, shown.covariances, shown.header))
             with timed(stages, "outputs"):
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
-                    gone = self._marker_ids.replaced(shown.shown_ids)
+                    gone = self._marker_ids.replace_markers(shown.shown_ids)
                     self.markers.publish(shown.markers(gone, parameters.marker_alpha))
                     self._header = shown.header
                 if self.rendered_depth.get_subscription_count():
@@ -154,24 +160,27 @@ class Outputs:
         except Exception as error:
             if self._node.context.ok():
                 self._node.get_logger().warning(
-                    f"a result was published without all that goes with it: {type(error).__name__}: {error}",
+                    f"a result was published without its other outputs: {type(error).__name__}: {error}",
                     throttle_duration_sec=THROTTLE,
                 )
 
 
-def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
-    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises ValueError if it is not known."""
+def pose_in(
+    poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame"
+) -> Pose:
+    """Return the pose of a header's frame in the tf2 frame of a parameter, at its stamp; ValueError if unknown."""
     try:
         return poses.at(header, frame_id, patience)
     except PoseError as error:
         raise ValueError(
-            f"target_frame: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
+            f"{parameter}: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
         ) from error
 
 
 def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
-    """Findings in another tf2 frame; as they are for an empty ``frame_id``.  Raises ValueError as :func:`pose_in`."""
-    return found.moved(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
+    """Return findings in another tf2 frame; unchanged for an empty ``frame_id``.  Raises ValueError as
+    :func:`pose_in`."""
+    return found.move(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 
 _KINDS = {
@@ -183,8 +192,7 @@ _KINDS = {
 
 
 class OptionalOutputs:
-    """Messages for other stacks, as far as the parameters ask for them; used by one thread at a time, except for
-    ``absent``."""
+    """Messages for other stacks that the parameters enable; used by one thread, except for ``absent``."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -196,7 +204,7 @@ class OptionalOutputs:
         self._all_due = 0.0
 
     def follow(self, parameters: RecoverParameters) -> None:
-        """Create the publishers that are asked for, and destroy the others."""
+        """Create the publishers that are enabled, and destroy the others."""
         asked = [parameter for parameter in _KINDS if getattr(parameters, parameter)]
         self.absent = {parameter: package for parameter, package in self.absent.items() if parameter in asked}
         for parameter in asked:
@@ -208,7 +216,7 @@ class OptionalOutputs:
             self._node.destroy_publisher(self._publishers.pop(parameter))
 
     def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
-        """Publish what a frame showed, where it is asked for and somebody listens.
+        """Publish a frame on the outputs that are enabled and have subscribers.
 
         Parameters
         ----------
@@ -235,7 +243,7 @@ class OptionalOutputs:
     def _publish_scene(
         self, planners: Publisher, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
     ) -> None:
-        """Publish what has changed of the planning scene, from time to time all of it."""
+        """Publish the changes of the planning scene, from time to time all of it."""
         if monotonic() >= self._all_due:
             self._scene.repeat()
             self._all_due = monotonic() + _ALL_AGAIN
@@ -253,7 +261,7 @@ class OptionalOutputs:
             planners.publish(collision_objects.planning_scene(objects))
 
     def withdraw(self) -> bool:
-        """Remove every object that was added to the planning scene, as nobody looks after it; whether there was one."""
+        """Remove every object from the planning scene, since nothing updates it; return whether there was one."""
         publisher = self._publishers.get("publish_collision_objects")
         objects = self._scene.clear() if publisher is not None else []
         if publisher is not None and objects:
@@ -261,7 +269,7 @@ class OptionalOutputs:
         return bool(objects)
 
     def close(self) -> None:
-        """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
+        """Destroy the publishers; objects stay in the planning scene and are remembered."""
         for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         self._publishers = {}
@@ -282,11 +290,11 @@ class OptionalOutputs:
             )
 
     def _note_listener(self, parameter: str, event: Any) -> None:
-        """A planner that has come, or has started again, knows nothing; called in the executor's thread."""
+        """Note a planner that has started and knows nothing; called in the executor's thread."""
         if parameter == "publish_collision_objects" and event.current_count_change > 0:
             self._planner_came.set()
 
     def _heard(self, parameter: str) -> Publisher | None:
-        """The publisher of what is asked for, if somebody listens."""
+        """Return the publisher of an enabled output, if it has subscribers."""
         publisher = self._publishers.get(parameter)
         return publisher if publisher is not None and publisher.get_subscription_count() else None

@@ -40,7 +40,7 @@ def _check_frame(name: str, frame: str) -> None:
 
 
 def _check_prefix(prefix: str) -> None:
-    """Without one a body would be called 7, which no tf2 frame and no collision object should be."""
+    """Check that the prefix makes valid names: 7 alone is none for a tf2 frame or a collision object."""
     _check_frame("tf_prefix", prefix)
     if not prefix:
         raise ParameterError(f"tf_prefix: expected something before the ids, such as {PREFIX}, got nothing")
@@ -48,7 +48,7 @@ def _check_prefix(prefix: str) -> None:
 
 @dataclass(frozen=True)
 class RecoverParameters(Parameters):
-    """recover_node, and each node of recover_cameras."""
+    """Parameters of recover_node, and of each node of recover_cameras."""
 
     autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     free_shared_memory: bool = setting(
@@ -62,112 +62,127 @@ class RecoverParameters(Parameters):
     )
     use_masks: str = setting(
         "auto",
-        "Label images on mask/image: auto segments images without one, always refuses them, never ignores masks.",
+        "Label images on mask/image: auto segments images without a mask, always refuses them, never ignores masks.",
         choices=("auto", "always", "never"),
     )
     patience: float = setting(0.25, "How long an image waits for camera_info or mask.", unit="s", within=(0.0, 10.0))
     image_transport: str = setting(
         RAW,
-        "How depth images come: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
+        "Input topic: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
         "depth/image/compressedDepth, points (sensor_msgs/PointCloud2, see docs/nodes.md) on depth/points.",
         choices=(RAW, compressed_depth.TRANSPORT, POINTS),
         live=False,
     )
     distortion: Treatment = setting(
         "auto",
-        "apply the coefficients of camera_info, ignore them, or auto: apply unless one of the last two parts of the "
-        "images' topic has the word rect or rectified.",
+        "apply the coefficients of camera_info, ignore them, or auto: apply them unless one of the last two parts of "
+        "the topic name contains the word rect or rectified.",
         choices=get_args(Treatment),
         live=False,
     )
     depth_scale: float = setting(
         0.0,
-        "Units a metre of depth images and points; 0: 1000 of 16UC1, 1 of 32FC1 and points. 32FC1 in millimetres: "
-        "1000; a D405's 16UC1: 10000.",
+        "Units per metre of depth images and points; 0: 1000 for 16UC1, 1 for 32FC1 and points. 32FC1 in millimetres: "
+        "1000; 16UC1 of a D405: 10000.",
         within=(0.0, 1e5),
     )
     depth_kind: DepthKind = setting(
         "z",
-        "What depth images hold: z along the optical axis, or range, the distance to the camera's centre (Isaac's "
+        "Meaning of depth values: z along the optical axis, or range, the distance to the camera's centre (Isaac's "
         "distance_to_camera).",
         choices=get_args(DepthKind),
     )
     s: float = setting(
         RecoveryOptions.sharpness,
-        "Sharpness of the soft occupancy sigma(s (1 - F^e1)) of the score.",
+        "Sharpness of the soft occupancy sigmoid(s (1 - F^e1)) in the score.",
         within=(0.1, 1000.0),
     )
-    tau: float = setting(RecoveryOptions.tau, "Sharpness of the soft depth projection, likewise.", within=(0.1, 100.0))
-    depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0))
+    tau: float = setting(
+        RecoveryOptions.tau, "Sharpness of the soft depth projection in the score.", within=(0.1, 100.0)
+    )
+    depth_min: float = setting(0.0, "Ignore nearer readings.", unit="m", within=(0.0, 100.0))
     depth_max: float = setting(
         _KEEPS_ALL,
-        f"Farther readings are left out; {_KEEPS_ALL:g} keeps all.",
+        f"Ignore farther readings; {_KEEPS_ALL:g} keeps all.",
         unit="m",
         within=(0.001, _KEEPS_ALL),
     )
-    max_objects: int = setting(RecoveryOptions.max_objects, "Most bodies a frame, the largest ones.", within=(1, 100))
+    max_objects: int = setting(
+        RecoveryOptions.max_objects, "Maximum number of bodies per frame; the largest are kept.", within=(1, 100)
+    )
     max_size: float = setting(
-        RecoveryOptions.max_size, "Largest full edge of objects that the node segments.", unit="m", within=(0.01, 100.0)
+        RecoveryOptions.max_size,
+        "Largest full edge of objects that the node segments itself.",
+        unit="m",
+        within=(0.01, 100.0),
     )
     workspace: tuple[float, ...] = setting(
         EVERYWHERE,
-        "Least x, y, z, then greatest x, y, z of the middle of what is seen of an object, in target_frame or, without "
-        "one, the image's; objects outside are left out.",
+        "Box, min x, y, z, max x, y, z, in target_frame or else the image's frame; objects whose visible part is "
+        "centred outside are ignored.",
         unit="m",
     )
     time_budget: float = setting(
         0.0,
-        "Time per frame after which no further start is tried, the largest and nearest objects first; 0: none.",
+        "Time per frame after which fits try no further starts, the largest and nearest objects first; 0: no limit.",
         unit="s",
         within=(0.0, 60.0),
     )
     tracking: bool = setting(
         True,
-        "Follow bodies from frame to frame and fuse their numbers; false: ids are mask labels, each frame stands for "
-        "itself.",
+        "Track bodies from frame to frame and fuse their numbers; false: ids are mask labels, frames are independent.",
     )
     fixed_frame: str = setting(
         "",
-        "tf2 frame that the bodies rest in, for a camera that moves. Empty: the camera stands still. A change ends the "
-        "tracks.",
+        "Static tf2 frame, for a moving camera. Empty: the camera is static. A change ends the tracks.",
     )
     marker_alpha: float = setting(ALPHA, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
     no_frame_warning: float = setting(
-        5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
+        5.0, "Warn after this time without a depth image; 0 never warns.", unit="s", within=(0.0, 3600.0)
     )
     target_frame: str = setting(
         "",
         "tf2 frame of the results, by the transform at the image's stamp; an image without it is refused. Empty: the "
-        "image's.",
+        "image's frame.",
+    )
+    camera_frame: str = setting(
+        "",
+        "tf2 frame, optical, of the camera that took the points (image_transport: points), where they come in another "
+        "one. Empty: that of the points.",
     )
     tf_tolerance: float = setting(
-        0.1, "How long an image waits for transforms (fixed_frame, target_frame).", unit="s", within=(0.0, 5.0)
+        0.1,
+        "How long an image waits for transforms (camera_frame, fixed_frame, target_frame).",
+        unit="s",
+        within=(0.0, 5.0),
     )
     publish_tf: bool = setting(False, "Publish a frame for each body on /tf.")
     tf_prefix: str = setting(
         PREFIX,
-        "Names of tf2 frames, detections and collision objects before the id. Two nodes need different ones: those of "
-        "recover_cameras have front_superquadric_ and so on.",
+        "Prefix of the id in names of tf2 frames, detections and collision objects. Two nodes need different ones; "
+        "recover_cameras uses front_superquadric_ and so on.",
     )
     publish_detections: bool = setting(False, "Publish ~/detections; needs vision_msgs.")
     publish_collision_objects: bool = setting(False, "Publish ~/planning_scene; needs moveit_msgs.")
     collision_shapes: str = setting(
         "primitive",
-        "Around each body: the smallest box, cylinder or sphere, quick to plan with, or a mesh that fits closely.",
+        "Shape around each body: the smallest box, cylinder or sphere, fast to plan with, or a close mesh.",
         choices=("primitive", "mesh"),
     )
 
     model: str = setting(
-        "", "Weights: a .safetensors file or the name of shipped ones; empty: the default. Set again, it is read again."
+        "", "Weights: a .safetensors file or a shipped name; empty: the default. Setting it again reloads the file."
     )
-    device: str = setting("cpu", "Where the network of bodies or hulls runs: cpu, cuda or cuda:N.")
-    threads: int = setting(0, "Objects worked on at the same time; 0: as many as there are cores.", within=(0, 256))
+    device: str = setting("cpu", "Device of the network for bodies or hulls: cpu, cuda or cuda:N.")
+    threads: int = setting(0, "Objects processed in parallel; 0: one per core.", within=(0, 256))
     method: Method = setting(
         "auto",
-        "auto: a network and a fit; symmetry: a fit alone; network: no fit; classic: Solina and Bajcsy's fit.",
+        "auto: network and fit; symmetry: fit only; network: network only; classic: Solina and Bajcsy's fit.",
         choices=get_args(Method),
     )
-    repair: bool = setting(True, "Part, join and drop own segments; leave readings of neighbours out of fits.")
+    repair: bool = setting(
+        True, "Split, join and drop own segments with a network; exclude readings of neighbours from fits."
+    )
 
     @property
     def box(self) -> Box | None:
@@ -175,7 +190,7 @@ class RecoverParameters(Parameters):
         return None if self.workspace == RecoverParameters.workspace else cast(Box, self.workspace)
 
     def recovery_options(self, pose: Pose | None = None, has_free_space: bool = True) -> RecoveryOptions:
-        """The options for a frame, whose pose in ``target_frame`` is given."""
+        """Return the options for a frame with this pose in ``target_frame``."""
         return RecoveryOptions(
             method=self.method,
             sharpness=self.s,
@@ -204,21 +219,23 @@ class RecoverParameters(Parameters):
                 raise ParameterError(
                     f"{name}: expected {expected or 'none'} for projection = orthographic, got {given}"
                 )
-        for name in ("fixed_frame", "target_frame"):
+        for name in ("camera_frame", "fixed_frame", "target_frame"):
             _check_frame(name, getattr(self, name))
+        if self.camera_frame and self.image_transport != POINTS:
+            raise ParameterError(f"camera_frame: expected image_transport = {POINTS}, got {self.image_transport}")
         _check_prefix(self.tf_prefix)
 
 
 @dataclass(frozen=True)
 class FitterParameters(RecoverParameters):
-    """fitter_node: recover_node with another method."""
+    """Parameters of fitter_node: those of recover_node with another method."""
 
     method: Method = field(default="classic", metadata=RecoverParameters.__dataclass_fields__["method"].metadata)
 
 
 @dataclass(frozen=True)
 class SyntheticParameters(Parameters):
-    """synthetic_depth_node."""
+    """Parameters of synthetic_depth_node."""
 
     scene: Literal["thesis", "table", "replay"] = setting(
         "table",
@@ -228,7 +245,9 @@ class SyntheticParameters(Parameters):
         live=False,
     )
     rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0))
-    seed: int = setting(0, "Seed of scenes and noise: equal seeds, equal images.", within=(0, 2**31 - 1), live=False)
+    seed: int = setting(
+        0, "Seed of scenes and noise: equal seeds give equal images.", within=(0, 2**31 - 1), live=False
+    )
     noise: float = setting(
         0.0,
         "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
@@ -237,13 +256,13 @@ class SyntheticParameters(Parameters):
     )
     sensor: str = setting(
         IDEAL,
-        "Depth sensor to imitate: ideal adds noise alone; the others have noise, steps, edges and holes of their own "
+        "Simulated sensor: ideal adds only noise; the others have their own noise, steps, edges and holes "
         "(docs/sensors.md).",
         choices=(IDEAL, *PRESETS),
     )
-    hold: int = setting(30, "Frames that a scene or recording stays; noise is fresh.", within=(1, 10**6), live=False)
-    scenes: int = setting(0, "Scenes before the end or the next round; 0: endless.", within=(0, 10**6), live=False)
-    loop: bool = setting(True, "Begin again after the last scene or recording; otherwise publish no more.", live=False)
+    hold: int = setting(30, "Frames per scene or recording; the noise changes.", within=(1, 10**6), live=False)
+    scenes: int = setting(0, "Number of scenes before it stops or repeats; 0: endless.", within=(0, 10**6), live=False)
+    loop: bool = setting(True, "Start again after the last scene or recording; false: stop publishing.", live=False)
     objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
     encoding: str = setting(
         "auto",
@@ -263,12 +282,12 @@ class SyntheticParameters(Parameters):
     path: str = setting("", "A recorded frame or a folder of them, for scene = replay.", live=False)
     camera_info_file: str = setting(
         "",
-        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which show no distortion.",
+        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, without distortion.",
         live=False,
     )
     projection: Projection = setting(
         "pinhole",
-        "Camera model of recorded images: 8 bit orthographic images look like depth images.",
+        "Camera model of recorded images, since 8 bit orthographic images look like depth images.",
         choices=get_args(Projection),
         live=False,
     )
@@ -283,7 +302,7 @@ class SyntheticParameters(Parameters):
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 
     def check(self, is_cube: bool, what: str) -> None:
-        """Raise ParameterError where ``what`` has images of the unit cube, or has none, and these expect the other."""
+        """Raise ParameterError if ``what`` has images of the unit cube and these parameters do not, or the reverse."""
         if self.encoding != "auto" and is_cube != (self.encoding in GREY_ENCODINGS):
             expected = " or ".join(GREY_ENCODINGS if is_cube else DEPTH_ENCODINGS)
             raise ParameterError(f"encoding: expected {expected} for {what}, got {self.encoding}")
@@ -293,30 +312,30 @@ class SyntheticParameters(Parameters):
 
 @dataclass(frozen=True)
 class GraspParameters(Parameters):
-    """grasp_node."""
+    """Parameters of grasp_node."""
 
-    autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.", live=False)
+    autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     max_age: float = setting(
         10.0,
-        "~/plan and ~/plan_grasps refuse when the last bodies are older; 0: never.",
+        "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.",
         unit="s",
         within=(0.0, 3600.0),
     )
     no_cloud_warning: float = setting(
-        5.0, "Warn when no bodies came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
+        5.0, "Warn after this time without bodies; 0 never warns.", unit="s", within=(0.0, 3600.0)
     )
-    tf_prefix: str = setting(PREFIX, "That of the recover_node: what ~/plan_grasps calls the bodies, before their ids.")
-    gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS))
-    friction: float = setting(FRICTION, "Least coefficient of friction between pads and things.", within=(0.05, 2.0))
+    tf_prefix: str = setting(PREFIX, "The tf_prefix of recover_node, for the names that ~/plan_grasps uses.")
+    gripper: str = setting("panda", "Gripper to plan for.", choices=tuple(GRIPPERS))
+    friction: float = setting(FRICTION, "Smallest friction coefficient between pads and objects.", within=(0.05, 2.0))
     placement: float = setting(
-        PLACEMENT, "Metres, one sigma, by which the hand is beside where it is sent to.", within=(0.0, 0.05)
+        PLACEMENT, "Standard deviation of the hand's position along each axis, metres.", within=(0.0, 0.05)
     )
-    min_score: float = setting(0.3, "Grasps that hold with less probability are not published.", within=(0.0, 1.0))
-    only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1))
+    min_score: float = setting(0.3, "Publish only grasps that hold with at least this probability.", within=(0.0, 1.0))
+    only_id: int = setting(-1, "Plan only for the body with this id; -1: for all.", within=(-1, 2**31 - 1))
     region: tuple[float, ...] = setting(
         EVERYWHERE,
-        "Plan for bodies whose centre is within least x, y, z and greatest x, y, z, in the frame of the cloud; the "
-        "default keeps all.",
+        "Plan for bodies with their centre in this box, min x, y, z, max x, y, z, in the cloud's frame; the default "
+        "keeps all.",
         unit="m",
     )
 

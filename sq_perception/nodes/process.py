@@ -1,12 +1,12 @@
-"""The life of a process with one or several nodes: start, spin, stop, each without a traceback.
+"""The process of one or several nodes: start, spin and stop without a traceback.
 
-Exit code 0 after Ctrl-C, SIGTERM or the end of the terminal, once, twice, or while a node still starts; 1 with one line
-of explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.  One
-thread spins all nodes: their callbacks only store messages, the work is done in threads of their own.
+Exit code 0 after Ctrl-C, SIGTERM or the end of the terminal, also twice or while a node starts; 1 with one line of
+explanation if a node cannot start.  The shipped Fast DDS profile is used unless the user has set one.  One thread spins
+all nodes: callbacks only store messages, other threads do the work.
 
-Garbage collection: numba and SciPy make 100 000 objects that live as long as the process.  While they are imported,
-260 collections find next to nothing and take 0.13 of 1.1 seconds; later each full collection would take 60 ms, in the
-middle of some frame.  So there is none while a node starts, and afterwards none of what the start made.
+Garbage collection: numba and SciPy make 100 000 objects that live as long as the process.  During their import 260
+collections would free almost nothing and take 0.13 of 1.1 seconds; later each full collection would take 60 ms, in the
+middle of a frame.  So collection is off while a node starts, and later excludes the objects of the start.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation
 
 
 class Stoppable(Protocol):
-    """An rclpy node that may fail to start, and has something to stop before it is destroyed."""
+    """An rclpy node that may fail to start, and must be stopped before it is destroyed."""
 
     start_failure: str
     """Why the node cannot start, once it has found out; its process then ends."""
@@ -61,7 +61,7 @@ class Stoppable(Protocol):
 
 
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
-    """Create nodes and spin them until they are asked to stop; the exit code.
+    """Create nodes and spin them until they are asked to stop; return the exit code.
 
     ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
     Nodes that it has yielded are closed also where a later one cannot be made.
@@ -120,8 +120,8 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
     return code
 
 
-def made(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
-    """A node of this class.
+def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
+    """Create a node of this class.
 
     Where it cannot be made, what is there of it is destroyed before the error goes on: the memory that it shares with
     other processes would outlive this one, and a launch file tries again and again.
@@ -137,7 +137,7 @@ def made(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
 
 
 def share_heaps() -> None:
-    """Let threads allocate from the same heaps: in those of their own each keeps what a frame has freed, 25 MB in all.
+    """Let threads allocate from the same heaps; heaps of their own keep what a frame has freed, 25 MB in all.
 
     Changes nothing without glibc.  For the start of a process: heaps that are there already stay.
     """
@@ -147,7 +147,7 @@ def share_heaps() -> None:
 
 @contextmanager
 def garbage_postponed() -> Iterator[None]:
-    """No garbage collection within the block, nor later of the objects that exist at its end; of new ones as ever.
+    """Postpone garbage collection within the block, and later exclude the objects that exist at its end.
 
     For the start of a process: reference cycles among those objects are never freed.
     """
@@ -162,20 +162,19 @@ def garbage_postponed() -> Iterator[None]:
 
 
 def keep_objects() -> None:
-    """Collect garbage once, and exclude what remains from further collections: it lives as long as a node is
-    configured."""
+    """Collect garbage once and exclude the rest from further collections, as it lives while a node is configured."""
     gc.collect()
     gc.freeze()
 
 
 def release_objects() -> None:
-    """As :func:`keep_objects`, but the objects that were excluded before are collected too."""
+    """Collect garbage as :func:`keep_objects`, including objects that were excluded before."""
     gc.unfreeze()
     keep_objects()
 
 
 class _Stop:
-    """Interrupts the start; while the node spins, asks it to end."""
+    """Signal handler that interrupts the start, or asks a spinning node to stop."""
 
     def __init__(self) -> None:
         self.starting = True
@@ -208,7 +207,7 @@ def _spin(nodes: Sequence[Any], executor: Executor, stop: _Stop) -> int:
 
 
 def _start_errors() -> tuple[type[Exception], ...]:
-    """What a wrong argument, parameter, file or name raises; rclpy's own errors are RuntimeErrors or these."""
+    """Return the errors of a wrong argument, parameter, file or name; rclpy's own are RuntimeErrors or these."""
     from rclpy.exceptions import NameValidationException, ParameterException
     from rclpy.qos_overriding_options import InvalidQosOverridesError
 

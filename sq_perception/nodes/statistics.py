@@ -1,7 +1,7 @@
 """Counts and latencies of a node, and their summary for diagnostics.
 
 Every received frame ends as exactly one of answered, dropped (a newer one came first, or the node is disabled) and
-refused (bad input); the rest is in work.  Counts are since the start, rates and latencies of the last seconds.
+refused (bad input); the rest is in progress.  Counts run from the start; rates and latencies cover the last seconds.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Standing = tuple[bytes, str]
 
 
 class Statistics:
-    """Collects from any thread; ``clock`` gives seconds, ``what`` is one of what is counted."""
+    """Counts and durations from any thread; ``clock`` gives seconds, ``what`` names what is counted."""
 
     def __init__(self, clock: Callable[[], float] = monotonic, what: str = "frame") -> None:
         self._clock, self._started, self._what = clock, clock(), what
@@ -52,7 +52,7 @@ class Statistics:
         self._last_error = self._last_answer = self._last_doubt = ""
 
     def count(self, what: str, number: int = 1) -> None:
-        """Add to received or dropped, or to WITHOUT_MASK."""
+        """Count a received or dropped frame, or one of WITHOUT_MASK."""
         with self._lock:
             self._counts[what] += number
             self._recent.extend([(self._clock(), what)] * number)
@@ -68,25 +68,25 @@ class Statistics:
         self.count("refused")
 
     def doubt(self, reason: str) -> None:
-        """Count an answered frame whose image seems to be in another unit or of another kind."""
+        """Count an answered frame whose image seems to have another unit or kind."""
         self._last_doubt = reason
         self.count(DOUBTED)
 
     def answer(self, milliseconds: Mapping[str, float], summary: str = "") -> None:
-        """Count an answered frame with the duration of its stages; ``summary`` explains also a lack of bodies."""
+        """Count an answered frame with its stage durations; ``summary`` also explains a lack of bodies."""
         self._last_answer = summary
         with self._lock:
             self._stages.append((self._clock(), milliseconds))
         self.count("answered")
 
     def report(self, node: Node, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticArray:
-        """The message of :meth:`status` for a node."""
+        """Return the message of :meth:`status` for a node."""
         message = DiagnosticArray(status=[self.status(node.get_fully_qualified_name(), standing, more)])
         message.header.stamp = node.get_clock().now().to_msg()
         return message
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
-        """The diagnostics of a node, and ``more`` that there is to know beside the frames.
+        """Return the diagnostics of a node, with ``more`` facts beside the frames.
 
         ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused, doubted,
         lost or left without a mask since the last status.

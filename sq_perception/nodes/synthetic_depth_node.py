@@ -7,8 +7,8 @@
 | `mask/image` | sensor_msgs/Image | out: label images (16UC1), where recordings have them or they are asked for |
 | `~/truth` | sensor_msgs/PointCloud2 | out: the bodies of generated scenes, in the message of the recovery |
 
-All carry the same stamp and frame.  Publishers are reliable, which best effort subscribers hear too.  The image goes
-last: whoever has it has the rest.
+All have the same stamp and frame.  Publishers are reliable, so best effort subscribers receive them too.  The image is
+published last: whoever has it has the rest.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings import camera_file, inputs
-from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
+from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generate, read, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
 from sq_perception.simulation.scenes import TABLE_CAMERA
 
 
 def frame_source(parameters: SyntheticParameters) -> FrameSource:
-    """The images that the parameters ask for.
+    """Return the images that the parameters ask for.
 
     Raises
     ------
@@ -48,10 +48,10 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
             camera_file.read_calibration(info, "ignore", size=inputs.ANY_SIZE)  # what is wrong with it is said at once
         paths = recordings(Path(parameters.path))
         with_labels = parameters.masks != "never"
-        count, make = len(paths), recorded(paths, info or None, parameters.projection, with_labels=with_labels)
+        count, make = len(paths), read(paths, info or None, parameters.projection, with_labels=with_labels)
     else:
         count = parameters.scenes
-        make = generated(
+        make = generate(
             parameters.scene,
             parameters.seed,
             objects=parameters.objects,
@@ -64,7 +64,7 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
 
 
 class SyntheticDepthNode(Node):
-    """Publishes a frame per tick of its timer.
+    """Node that publishes one frame per tick of its timer.
 
     Raises
     ------
@@ -86,7 +86,7 @@ class SyntheticDepthNode(Node):
         self.get_logger().info(f"publishing {self._settings.current.scene} frames on {self._image.topic_name}")
 
     def close(self) -> bool:
-        """There is nothing to wait for."""
+        """Return at once: there is nothing to wait for."""
         return True
 
     def _check(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:

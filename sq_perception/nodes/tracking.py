@@ -1,7 +1,7 @@
-"""Which track each body of a frame belongs to, in the camera's frame or a fixed one, and what is published of it.
+"""Tracks of the bodies of each frame, in the camera's frame or a fixed one, and their published numbers.
 
-tf2_ros comes with a ROS installation and is not on PyPI: it is imported, and /tf listened to, only once a frame is
-asked for.  A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
+tf2_ros comes with a ROS installation and is not on PyPI: it is imported, and /tf subscribed to, only once a frame is
+requested.  A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rclpy.time import Time
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings.publication import Identified, identified
+from sq_perception.recordings.publication import Identified, identify
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally, TrackingSession
 
@@ -30,11 +30,11 @@ _LEAST_LENGTH = 1e-6
 
 
 class PoseError(ValueError):
-    """The pose of a frame is not known; the message has the reason."""
+    """Error with the reason why the pose of a frame is unknown."""
 
 
 class CameraPoses:
-    """Looks up poses of optical frames; without tf2 every look-up fails with that reason."""
+    """Poses of optical frames from tf2; without tf2 every look-up fails with that reason."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -44,7 +44,7 @@ class CameraPoses:
         self._stamp = 0
 
     def listen(self) -> None:
-        """Begin to listen to /tf, if that was not done yet; a buffer knows only what it has heard."""
+        """Start to listen to /tf once; a buffer knows only what it has received."""
         if self._buffer is not None or self._missing:
             return
         try:
@@ -56,7 +56,8 @@ class CameraPoses:
         self._listener = tf2.TransformListener(self._buffer, self._node)
 
     def at(self, header: Any, frame: str, patience: float = 0.1) -> Pose:
-        """The pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.  Raises PoseError.
+        """Return the pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.  Raises
+        PoseError.
 
         It is waited for, ``patience`` seconds at most; transforms arrive in the node's executor, in whose thread this
         must not be called.
@@ -81,7 +82,7 @@ class CameraPoses:
         return quaternion / length, translation
 
     def follow(self, stamp: int) -> None:
-        """Note the stamp of the next image, nanoseconds, before its pose is asked for.
+        """Note the stamp of the next image, nanoseconds, before its pose is requested.
 
         After a jump back, as where a recording begins again, what was heard is forgotten: transforms of the old time
         would shadow the new ones, and tf2 takes none that is 10 s older than its newest.
@@ -91,14 +92,14 @@ class CameraPoses:
         self._stamp = stamp
 
     def close(self) -> None:
-        """Listen no more, until a frame is asked for again."""
+        """Stop listening until a frame is requested again."""
         if self._listener is not None:
             self._listener.unregister()
         self._buffer = self._listener = None
 
 
 class Tracking:
-    """Gives the bodies of a node's frames their ids; used by one thread, except for ``tally``.
+    """Ids of the bodies of a node's frames; used by one thread, except for ``tally``.
 
     Ids outlive a restart after a fault: a body keeps its name.  ``poses`` are asked only while there is a fixed frame.
     """
@@ -112,7 +113,7 @@ class Tracking:
 
     @property
     def tally(self) -> Tally:
-        """Counts of the tracking session."""
+        """Return the counts of the tracking session."""
         return self._session.tally
 
     def identify(
@@ -123,14 +124,14 @@ class Tracking:
         arrival: float,
         parameters: RecoverParameters,
     ) -> Identified:
-        """Bodies and ids of their tracks; without ``tracking`` ids are labels, and what was tracked is forgotten.
+        """Return bodies with the ids of their tracks; without ``tracking`` ids are labels, and tracks are dropped.
 
         Numbers of another ``origin``, method or model, are not fused with these: a change ends the tracks.  ``arrival``
         is the time, seconds, of an image without stamp.  Raises ValueError if the tracker cannot go on; it begins anew.
         """
         if not parameters.tracking:
             self._session.reset()
-            return identified(recovery)
+            return identify(recovery)
         if self._origin not in (None, origin):
             self._forget("bodies come from another method or model from now on")
         self._origin = origin
@@ -150,11 +151,11 @@ class Tracking:
             self._session.reset()
             raise ValueError(f"tracking: {error}") from error
         if self._session.tally.resets > resets:
-            self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
-        return identified(recovery, tracks, self._session.hidden)
+            self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are dropped, ids continue")
+        return identify(recovery, tracks, self._session.hidden)
 
     def _camera_pose(self, frame: Frame, parameters: RecoverParameters) -> tuple[Pose | None, bool]:
-        """The camera's pose in ``fixed_frame``, None without such a frame, and False where it is not known."""
+        """Return the camera's pose in ``fixed_frame``, None without such a frame, False if it is unknown."""
         if not parameters.fixed_frame:
             return None, True
         try:
@@ -167,4 +168,4 @@ class Tracking:
 
     def _forget(self, why: str) -> None:
         self._session.reset()
-        self._node.get_logger().info(f"{why}: tracks are forgotten, ids go on")
+        self._node.get_logger().info(f"{why}: tracks are dropped, ids continue")

@@ -38,7 +38,7 @@ from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import bag_camera, publication
 from sq_perception.recordings.bag_camera import raw_topic
-from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, described
+from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, describe
 from sq_perception.recordings.camera_file import read_camera_info
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
@@ -145,7 +145,7 @@ class RecordedBag:
         self._orthographic = self._options.projection == "orthographic"
         with ExitStack() as opened:
             self._reader = opened.enter_context(closing(BagReader(self._path)))
-            self.topic = self._chosen(self._options.topic)
+            self.topic = self._choose(self._options.topic)
             first = next(self._first_images(self.topic), None)
             self._info_topic = bag_camera.info_topic(self._reader, self.topic, first, self._options.camera_info_topic)
             others = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
@@ -176,7 +176,7 @@ class RecordedBag:
 
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
         try:
-            for found in self._paired():
+            for found in self._pair():
                 if isinstance(found, FrameError):
                     yield found
                 else:
@@ -184,7 +184,7 @@ class RecordedBag:
         except FrameError as error:
             yield error
 
-    def _paired(self) -> Iterator[tuple[Message, Message | None] | FrameError]:
+    def _pair(self) -> Iterator[tuple[Message, Message | None] | FrameError]:
         """The images in their order, each with its camera_info if one is needed and there is one."""
         needs_info = self._options.camera_info is None and not self._orthographic
         latest: Message | None = None
@@ -214,7 +214,7 @@ class RecordedBag:
 
     # topics
 
-    def _chosen(self, wanted: str | None) -> str:
+    def _choose(self, wanted: str | None) -> str:
         """The topic that was asked for, or the one that shows depth."""
         images = sorted({connection.topic for connection in self._reader.connections(IMAGE, COMPRESSED)})
         encodings: dict[str, str | None] = {}
@@ -305,11 +305,11 @@ class RecordedBag:
         if self._is_done(message.stamp):
             return
         try:
-            yield self._decoded(message, info)
+            yield self._decode(message, info)
         except (ValueError, MemoryError) as error:
-            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {described(error)}")
+            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {describe(error)}")
 
-    def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
+    def _decode(self, message: Message, info: Message | None) -> RecordedFrame:
         name, reading, warnings = frame_name(self._path, message.stamp), self._options.reading, []
         known: Any = None if info is None else info.content
         if self._options.camera_info is not None and not self._orthographic:
@@ -324,9 +324,9 @@ class RecordedBag:
             if known is None:
                 raise ValueError(self._info_topic.absent)
             calibration = Calibration.of(known, self.topic, self._options.distortion)
-            labels = None if labels is None else calibration.rectified_labels(labels)
+            labels = None if labels is None else calibration.rectify_labels(labels)
             camera = calibration.camera
-            depth = reading.z(calibration.rectified(depth), camera)
+            depth = reading.z(calibration.rectify(depth), camera)
             warnings += [f"{self.topic}: {calibration.note}"] if calibration.note else []
             notes = (*([self._info_topic.note] if info is not None and self._info_topic.note else ()), *notes)
         if len(self._mask_topics) > 1 and reading.masks is None and not reading.ignore_masks:

@@ -69,7 +69,7 @@ class BagReader:
             except StopIteration:
                 return
             except Exception as error:  # whatever damaged indices, chunks and pages lead to
-                raise FrameError(f"{self.path}: cannot be read any further: {described(error)}") from error
+                raise FrameError(f"{self.path}: cannot be read any further: {describe(error)}") from error
             if connection.msgtype != CAMERA_INFO:
                 before, seen = seen, seen + 1
                 if before % every:
@@ -83,7 +83,7 @@ class BagReader:
                 recorded = Stamp(*divmod(nanoseconds, 10**9))
                 yield FrameError(
                     f"{self.path}: {connection.topic} recorded at {recorded}: not a readable {connection.msgtype}: "
-                    f"{described(error)}"
+                    f"{describe(error)}"
                 )
                 continue
             yield Message(content, connection.msgtype, stamp, nanoseconds)
@@ -100,7 +100,7 @@ def _open(path: Path) -> tuple[Any, Any]:
         raise FrameError(
             f"{path}: reading bags needs the module 'rosbags': pip install 'sq_perception[bags]'"
         ) from error
-    storage_mcap.DECOMPRESSORS.update({"zstd": _unpacked, "lz4": _unpacked_lz4})
+    storage_mcap.DECOMPRESSORS.update({"zstd": _unpack, "lz4": _unpack_lz4})
     if path.is_dir():
         _refuse_packed_files(path)
     try:
@@ -108,7 +108,7 @@ def _open(path: Path) -> tuple[Any, Any]:
         reader.open()
     except Exception as error:  # whatever damaged files lead to
         cut = " (of a recording that was cut short, mcap recover saves what is there)" * (_CUT in str(error).lower())
-        raise FrameError(f"{path}: not a readable bag: {described(error)}{cut}") from error
+        raise FrameError(f"{path}: not a readable bag: {describe(error)}{cut}") from error
     storages: list[Any] = [reader.storage]
     if isinstance(reader.storage, rosbag2.reader.DirectoryReader):
         # Messages packed one by one would be unpacked without a bound; so they come as they are, for _plain.
@@ -125,7 +125,7 @@ def _refuse_packed_files(folder: Path) -> None:
     try:
         document = plain_yaml.read(folder / "metadata.yaml")
     except plain_yaml.YamlError as error:
-        raise FrameError(f"{folder}: metadata.yaml: {described(error)}") from error
+        raise FrameError(f"{folder}: metadata.yaml: {describe(error)}") from error
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
     if not isinstance(information, dict):
         raise FrameError(f"{folder}: metadata.yaml: expected rosbag2_bagfile_information")
@@ -135,25 +135,25 @@ def _refuse_packed_files(folder: Path) -> None:
 
 def _plain(data: bytes) -> bytes:
     """A message's bytes, unpacked where it was packed by itself."""
-    return _unpacked(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
+    return _unpack(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
 
 
-def _unpacked(data: bytes, size: int) -> bytes:
+def _unpack(data: bytes, size: int) -> bytes:
     """zstd, never more than ``size`` bytes: a megabyte can claim to be 32 GB."""
     try:
         from compression import zstd  # Python 3.14
     except ImportError:
         from backports import zstd
-    return _bounded(zstd.ZstdDecompressor(), data, size)
+    return _bound(zstd.ZstdDecompressor(), data, size)
 
 
-def _unpacked_lz4(data: bytes, size: int) -> bytes:
+def _unpack_lz4(data: bytes, size: int) -> bytes:
     from lz4.frame import LZ4FrameDecompressor
 
-    return _bounded(LZ4FrameDecompressor(), data, size)
+    return _bound(LZ4FrameDecompressor(), data, size)
 
 
-def _bounded(decompressor: Any, data: bytes, size: int) -> bytes:
+def _bound(decompressor: Any, data: bytes, size: int) -> bytes:
     if size > LARGEST:
         raise ValueError(f"expected at most {LARGEST} bytes unpacked, {size} are announced")
     unpacked: bytes = decompressor.decompress(data, max_length=size + 1)
@@ -162,7 +162,7 @@ def _bounded(decompressor: Any, data: bytes, size: int) -> bytes:
     return unpacked
 
 
-def described(error: Exception) -> str:
+def describe(error: Exception) -> str:
     """An error's message in one line, with its kind where that alone is informative."""
     text = " ".join(str(error).split())[:300]
     return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}".rstrip(": ")

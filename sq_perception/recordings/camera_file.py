@@ -164,7 +164,7 @@ def read_camera_info(source: str | Path, size: tuple[int, int] | None = None, na
             document: Any = dict(zip((_FX, _FY, _CX, _CY), numbers, strict=True))
         else:
             document = camera_document.read(Path(source))
-        found = _chosen(document, size, name)
+        found = _choose(document, size, name)
         if found.unit is None:
             return found
         return replace(found, unit=replace(found.unit, source=f"{Path(source).name}: {found.unit.source}"))
@@ -207,7 +207,7 @@ class _Found:
         return self.fields[field][1] if field in self.fields else None
 
 
-def _chosen(document: Any, size: tuple[int, int] | None, name: str | None) -> CameraInfo:
+def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> CameraInfo:
     """The camera of a document that is meant: of the image's number and size, and of depth."""
     if not isinstance(document, dict | list):
         raise FrameError("expected a camera_info as a YAML mapping, JSON, or 3 x 3 numbers")
@@ -315,7 +315,7 @@ def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
         _count(one.get("binning x"), "binning_x"),
         _count(one.get("binning y"), "binning_y"),
         Region(*(_count(region.get(part), part) for part in ("x_offset", "y_offset", "width", "height"))),
-        depth_units.stated(float(unit), name) if is_unit else None,
+        depth_units.parse_scale(float(unit), name) if is_unit else None,
     )
 
 

@@ -3,7 +3,8 @@
 An ORGANISED cloud (a PCD of several rows) of a pinhole camera IS a depth image: z, and the camera from the points
 themselves, as u = fx x / z + cx.  Any other cloud is looked at from the origin: each pixel takes its nearest point.
 Nothing is then known of the space beside an object (``RecordedFrame.has_free_space``), as points of several views, or
-thinned ones, leave gaps through which one sees what is behind.  Points far off the axis are left out.
+thinned ones, leave gaps through which one sees what is behind.  Points far off the axis are left out.  A field
+``instance`` or ``label`` of the points holds the objects that they belong to, 0 for none: the masks of the image.
 
 References: PCD, https://pointclouds.org/documentation/tutorials/pcd_file_format.html; LZF, which packs it, is
 http://oldhome.schmorp.de/marc/liblzf.html; trimesh reads PLY.
@@ -12,15 +13,18 @@ http://oldhome.schmorp.de/marc/liblzf.html; trimesh reads PLY.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError, npy_array
+from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError, npy_array, npz_arrays
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 
 SUFFIXES = (".pcd", ".ply")
+LABEL_FIELDS = ("instance", "label")
+"""Fields with the object of each point; the first of them that is there counts."""
+LABELLED = "the labels of the points are the masks of objects (ignore masks: segment instead)"
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")
 """Files that may hold a mesh; a PLY or OBJ may be a cloud as well."""
 UNORGANISED = (
@@ -54,8 +58,24 @@ _NEIGHBOURS = 2000
 """Points whose nearest neighbour gives the density of the cloud."""
 
 
-def read_points(path: Path) -> np.ndarray:
-    """Points (height, width, 3), one row where they are not organised; NaN for none.
+class Cloud(NamedTuple):
+    """Points (height, width, 3), one row where they are not organised, NaN for none; and int32 labels, if any."""
+
+    points: np.ndarray
+    labels: np.ndarray | None
+
+
+class CloudImage(NamedTuple):
+    """A cloud as a depth image (height, width), its camera, labels, and whether the points were an image before."""
+
+    depth: np.ndarray
+    camera: Camera
+    labels: np.ndarray | None
+    is_image: bool
+
+
+def read_cloud(path: Path) -> Cloud:
+    """The points and labels of a PCD, a PLY, or an NPZ of ``points`` and ``labels``.
 
     Raises
     ------
@@ -64,13 +84,28 @@ def read_points(path: Path) -> np.ndarray:
     """
     if path.stat().st_size > MOST_BYTES:
         raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    reader = {".pcd": _pcd, ".npz": _npz}.get(path.suffix.lower(), _ply)
     try:
-        points = _pcd(path.read_bytes()) if path.suffix.lower() == ".pcd" else _ply(path)
+        points, labels = reader(path)
     except UnpackingError:
         raise
     except Exception as error:  # whatever damaged files lead to
         raise UnpackingError(f"not a readable cloud: {type(error).__name__}: {error}") from error
-    return points.astype(float)
+    return Cloud(points.astype(float), None if labels is None else labels_of(labels))
+
+
+def labels_of(numbers: np.ndarray) -> np.ndarray:
+    """Labels as int32, 0 for what is none: negative, or NaN.
+
+    Raises
+    ------
+    UnpackingError
+        If they are no whole numbers below 2^31.
+    """
+    found = np.nan_to_num(numbers.astype(float), nan=0.0, posinf=np.inf, neginf=0.0).clip(0)
+    if found.size and (found.max() > np.iinfo(np.int32).max or (found != np.rint(found)).any()):
+        raise UnpackingError(f"labels: expected whole numbers below 2^31, got {found.max():g}")
+    return found.astype(np.int32)
 
 
 def read_surface(path: Path) -> Any:
@@ -88,7 +123,7 @@ def read_surface(path: Path) -> Any:
             raise UnpackingError(f"expected an array of shape (n, 3), got {array.shape}")
         return array
     if suffix == ".pcd":
-        return read_points(path).reshape(-1, 3)
+        return read_cloud(path).points.reshape(-1, 3)
     if suffix not in MESH_SUFFIXES:
         raise UnpackingError(f"expected a name that ends in .pcd, .npy, {', '.join(MESH_SUFFIXES)}")
     import trimesh
@@ -105,8 +140,8 @@ def read_surface(path: Path) -> Any:
         raise UnpackingError(f"not a readable cloud or mesh: {type(error).__name__}: {error}") from error
 
 
-def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
-    """Depth (height, width), its camera, and whether the points were an image before.
+def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage:
+    """The image of points (height, width, 3) and their labels (height, width).
 
     Raises
     ------
@@ -123,7 +158,7 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     expected = (
         f"expected {_LEAST_POINTS} points or more, most of them before the camera: x right, y down, z forward from it; "
         f"of {count} points {behind:.0%} are behind it and {off:.0%} more than 60 degrees off its axis. A cloud in the "
-        "frame of a robot, a table or a map (z up) has to be transformed into the camera's optical frame; "
+        "frame of a robot, a table or a map (z up) needs --frame (of a node: camera_frame); "
         "clouds of whole objects are for sq-perception fit"
     )
     if behind > 0.5:
@@ -138,20 +173,20 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
         error = np.abs(tangents * [fx, fy] + [cx, cy] - np.stack([u, v], axis=1))
         if min(fx, fy) > 0 and np.count_nonzero(error < _PIXEL_ERROR) > _ON_PIXELS * error.size:
             depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
-            return depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), True
+            return CloudImage(depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), labels, True)
     if np.count_nonzero(near) < max(_LEAST_POINTS, (1 - _MOST_UNSEEN) * count):
         raise UnpackingError(expected)
     x, y, z = points[near].astype(float).T
     tangents = np.stack([x / z, y / z], axis=1)
-    if (layered := _layered(tangents, z)) > _MOST_LAYERED:
+    if (layered := _is_layered(tangents, z)) > _MOST_LAYERED:
         raise UnpackingError(
             f"{layered:.0%} of the points lie before or behind others, as in the cloud of a whole object and not in "
             "that of one camera: sq-perception fit takes clouds of whole objects"
         )
-    return (*_seen(tangents, z), False)
+    return _seen(tangents, z, None if labels is None else labels[near])
 
 
-def _layered(tangents: np.ndarray, z: np.ndarray) -> float:
+def _is_layered(tangents: np.ndarray, z: np.ndarray) -> float:
     """The share of points whose neighbours in the image lie on no common plane: those of a front and a back."""
     from scipy.spatial import cKDTree
 
@@ -176,8 +211,8 @@ def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:
     return focal, float(pixels.mean() - focal * middle) if focal else 0.0
 
 
-def _seen(tangents: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, Camera]:
-    """The nearest depth in each pixel of a camera that is as fine as the points."""
+def _seen(tangents: np.ndarray, z: np.ndarray, labels: np.ndarray | None) -> CloudImage:
+    """The nearest point in each pixel of a camera that is as fine as the points."""
     from scipy.spatial import cKDTree
 
     some = tangents[:: max(1, len(tangents) // _NEIGHBOURS)]
@@ -187,21 +222,44 @@ def _seen(tangents: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, Camera]:
     pixel = max(spacing * np.sqrt(_POINTS_A_PIXEL), finest, 1e-9)
     width, height = (int(side) + 2 for side in np.ceil((high - low) / pixel))
     column, row = np.rint((tangents - low) / pixel).astype(int).T
-    depth = np.full((height, width), np.inf, np.float32)
-    np.minimum.at(depth, (row, column), z.astype(np.float32))
+    order = np.argsort(-z, kind="stable")  # of what is assigned to one pixel the last counts
+    depth = np.full((height, width), np.nan, np.float32)
+    depth[row[order], column[order]] = z[order]
+    shown = None if labels is None else np.zeros((height, width), np.int32)
+    if shown is not None and labels is not None:
+        shown[row[order], column[order]] = labels[order]
     camera = Camera(width, height, 1 / pixel, 1 / pixel, float(-low[0] / pixel), float(-low[1] / pixel))
-    return np.where(np.isfinite(depth), depth, np.float32(np.nan)), camera
+    return CloudImage(depth, camera, shown, False)
 
 
-def _ply(path: Path) -> np.ndarray:
+_Parts = tuple[np.ndarray, np.ndarray | None]
+"""Points (height, width, 3) and labels (height, width) of a file, as it has them."""
+
+
+def _npz(path: Path) -> _Parts:
+    fields = npz_arrays(path, ("points", "labels"))
+    points, labels = fields["points"], fields.get("labels")
+    if points.dtype.kind not in "fiu" or points.ndim not in (2, 3) or points.shape[-1] != 3:
+        raise UnpackingError(f"points: expected (n, 3) or (height, width, 3), got {points.dtype} {points.shape}")
+    if labels is not None and (labels.dtype.kind not in "fiub" or labels.shape != points.shape[:-1]):
+        raise UnpackingError(f"labels: expected numbers {points.shape[:-1]}, got {labels.dtype} {labels.shape}")
+    points = points[None] if points.ndim == 2 else points
+    return points, None if labels is None else labels.reshape(points.shape[:2])
+
+
+def _ply(path: Path) -> _Parts:
     import trimesh
 
     found: Any = trimesh.load(path, file_type="ply", process=False)
     points: np.ndarray = np.array(found.vertices, dtype=np.float64)
-    return points[None]
+    data = found.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
+    names = data.dtype.names if isinstance(data, np.ndarray) else data
+    name = next((name for name in LABEL_FIELDS if name in names), None)
+    return points[None], None if name is None else np.asarray(data[name]).reshape(1, len(points))
 
 
-def _pcd(data: bytes) -> np.ndarray:
+def _pcd(path: Path) -> _Parts:
+    data = path.read_bytes()
     head: dict[str, list[str]] = {}
     at = 0
     while "DATA" not in head:
@@ -214,11 +272,17 @@ def _pcd(data: bytes) -> np.ndarray:
         raise UnpackingError(f"expected 1 to {MOST_PIXELS} points, got {width} x {height}")
     counts = [int(part) for part in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
     kinds = [f"<{_NUMBERS[kind]}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
-    where = [head["FIELDS"].index(axis) for axis in "xyz"]
+    field = next((name for name in LABEL_FIELDS if name in head["FIELDS"]), None)
+    where = [head["FIELDS"].index(name) for name in ("x", "y", "z", *([field] if field else []))]
+
+    def parts(columns: list[np.ndarray]) -> _Parts:
+        labels = columns[3].reshape(height, width) if field else None
+        return np.stack(columns[:3], axis=1).reshape(height, width, 3), labels
+
     if head["DATA"] == ["ascii"]:
         columns = np.cumsum([0, *counts])
         table = np.array(data[at:].split(), dtype=float).reshape(count, columns[-1])
-        return table[:, [columns[k] for k in where]].reshape(height, width, 3)
+        return parts([table[:, columns[k]] for k in where])
     layout = np.dtype([(f"{k}", kind, (number,)) for k, (kind, number) in enumerate(zip(kinds, counts, strict=True))])
     if head["DATA"] == ["binary_compressed"]:
         # Packed column by column: all x, then all y.
@@ -229,12 +293,11 @@ def _pcd(data: bytes) -> np.ndarray:
         if not _unpack(np.frombuffer(data, np.uint8, packed, at + 8), unpacked):
             raise UnpackingError("expected bytes that LZF packed")
         ends = count * np.cumsum([0, *(layout[k].itemsize for k in range(len(kinds)))])
-        parts = [unpacked[ends[k] : ends[k + 1]].view(kinds[k]).reshape(count, counts[k])[:, 0] for k in where]
-        return np.stack(parts, axis=1).reshape(height, width, 3)
+        return parts([unpacked[ends[k] : ends[k + 1]].view(kinds[k]).reshape(count, counts[k])[:, 0] for k in where])
     if head["DATA"] != ["binary"]:
         raise UnpackingError(f"DATA: expected ascii, binary or binary_compressed, got {' '.join(head['DATA'])}")
     rows = np.frombuffer(data, layout, count, at)
-    return np.stack([rows[f"{k}"][:, 0] for k in where], axis=1).reshape(height, width, 3)
+    return parts([rows[f"{k}"][:, 0] for k in where])
 
 
 @kernel

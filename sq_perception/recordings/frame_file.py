@@ -5,7 +5,7 @@
 | ``.npz`` | ``depth`` (h, w), ``K`` (3, 3) | floats: metres; whole numbers: millimetres, or by ``depth_scale`` |
 | ``.npy``, ``.tif`` of floats, ``.exr`` | a camera_info | metres; rectified where it is raw |
 | ``.png``, ``.tif``, ``.npy`` of whole numbers | a camera_info | millimetres, or as it states; likewise |
-| ``.pcd``, ``.ply`` | nothing | points in metres, see :mod:`sq_perception.recordings.cloud_file` |
+| ``.pcd``, ``.ply``, ``.npz`` of ``points`` | nothing | metres: :mod:`sq_perception.recordings.cloud_file` |
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
 | ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
@@ -33,13 +33,14 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from sq_perception.files.unpacking import UnpackingError, exr_image, grey_image, npy_array, npz_arrays
+from sq_perception.files.unpacking import exr_image, grey_image, npy_array, npz_arrays
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.imaging.depth_units import MILLIMETRES, DepthKind, Metres, Stated
-from sq_perception.recordings import cloud_file
+from sq_perception.recordings import cloud_file, mask_file
 from sq_perception.recordings.camera_file import FrameError, calibration, camera_beside, read_camera_info
+from sq_perception.recordings.cloud_frame import CloudFrame
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
 TUM = Stated(5000.0, "the name is one of the TUM RGB-D benchmark")
@@ -119,11 +120,13 @@ class Reading:
     region : (4,) of int or None
         Left column, top row, width and height of the part to look at, pixels of the rectified image.
     masks : Path or None
-        A folder with a label image for each frame, of its name and ``.png``: 0 is background.
+        A folder with the masks of each frame, by its name (:mod:`sq_perception.recordings.mask_file`).
     ignore_masks : bool
         Whether no labels are read, wherever they are.
     kind : str
         "z", or "range" for images of distances to the camera's centre.
+    frame : CloudFrame or None
+        Where the camera is in the frame of clouds; None: in their origin, and looks along z.
 
     Raises
     ------
@@ -138,6 +141,7 @@ class Reading:
     masks: Path | None = None
     ignore_masks: bool = False
     kind: DepthKind = "z"
+    frame: CloudFrame | None = None
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 0 < self.scale < math.inf:
@@ -163,16 +167,15 @@ class Reading:
         """
         if self.masks is None or self.ignore_masks:
             return None
-        path = self.masks / f"{name}.png"
-        if not path.is_file():
-            raise FrameError(f"{path}: no such mask")
         try:
-            labels = grey_image(path)
-        except UnpackingError as error:
-            raise FrameError(f"{path}: {error}") from error
+            labels = mask_file.read(self.masks, name)
+        except ValueError as error:
+            raise FrameError(str(error)) from error
         if labels.shape != like.shape:
-            raise FrameError(f"{path}: expected labels of the depth's shape {like.shape}, got {labels.shape}")
-        return labels.astype(np.int32)
+            raise FrameError(
+                f"{self.masks / name}: expected labels of the depth's shape {like.shape}, got {labels.shape}"
+            )
+        return labels
 
     def of(self, frame: RecordedFrame) -> RecordedFrame:
         """The frame within the limits, with a warning where it seems to be another kind of image.
@@ -252,12 +255,12 @@ def _read(
 ) -> RecordedFrame:
     """The frame; a ValueError that is no FrameError is about the file."""
     suffix = path.suffix.lower()
+    if suffix in cloud_file.SUFFIXES:
+        return _read_cloud(path, reading)
     if suffix == ".npz":
         frame = _read_npz(path, projection, reading)
         labels = reading.labels(path.stem, frame.depth)
         return frame if labels is None else replace(frame, labels=labels)
-    if suffix in cloud_file.SUFFIXES:
-        return _read_cloud(path, reading)
     if suffix == ".bag":
         raise ValueError(f"a bag of ROS 1: convert it with: rosbags-convert --src {path} --dst {path.stem}")
     if suffix not in SUFFIXES:
@@ -297,8 +300,8 @@ def _of_pinhole(
     if not (-1 < camera.cx < camera.width and -1 < camera.cy < camera.height):
         middle, shape = f"{camera.cx:g}, {camera.cy:g}", f"{camera.width} x {camera.height}"
         warnings.append(f"{camera_info}: the middle {middle} is beside an image of {shape}: another resolution's?")
-    depth, labels = reading.z(way.rectified(found.depth), camera), reading.labels(path.stem, image)
-    labels = None if labels is None else way.rectified_labels(labels)
+    depth, labels = reading.z(way.rectify(found.depth), camera), reading.labels(path.stem, image)
+    labels = None if labels is None else way.rectify_labels(labels)
     encoding = "16UC1" if found.scale == MILLIMETRES and image.dtype == np.uint16 and reading.kind == "z" else "32FC1"
     return RecordedFrame(
         depth, camera, labels, path.name, warning="; ".join(warnings), notes="; ".join(found.notes), encoding=encoding
@@ -321,14 +324,31 @@ def stamp_of(path: Path) -> Stamp | None:
 
 
 def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
-    depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
     if reading.kind != "z":
         raise ValueError("a cloud has points, and no distances in place of z")
-    if reading.masks is not None and not is_image:
+    points, labels = cloud_file.read_cloud(path)
+    points, notes = points / (reading.scale or 1.0), []
+    if reading.frame is not None:
+        points, said = reading.frame.optical(points)
+        notes.append(said)
+    found = cloud_file.as_image(points, None if reading.ignore_masks else labels)
+    if reading.masks is not None and not found.is_image:
         raise ValueError("a cloud that is no image has no pixels that a mask could be of")
-    labels = reading.labels(path.stem, depth)
-    warning = "" if is_image else cloud_file.UNORGANISED
-    return RecordedFrame(depth, camera, labels, path.name, warning=warning, encoding="32FC1", has_free_space=is_image)
+    given = reading.labels(path.stem, found.depth)
+    if given is None and found.labels is not None:
+        given = found.labels
+        notes.append(cloud_file.LABELLED)
+    warning = "" if found.is_image else cloud_file.UNORGANISED
+    return RecordedFrame(
+        found.depth,
+        found.camera,
+        given,
+        path.name,
+        warning=warning,
+        notes="; ".join(notes),
+        encoding="32FC1",
+        has_free_space=found.is_image,
+    )
 
 
 def _likely_mistake(frame: RecordedFrame) -> str:
@@ -344,7 +364,9 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     wanted = ("depth", "K", "projection", "depth_scale") + ("labels",) * (not reading.ignore_masks)
     fields = npz_arrays(path, wanted)
     if "depth" not in fields:
-        raise ValueError("expected a field 'depth' in metres")
+        if npz_arrays(path, ["points"]):
+            return _read_cloud(path, reading)
+        raise ValueError("expected a field 'depth' in metres, or 'points' of a cloud")
     depth, labels = fields["depth"], fields.get("labels")
     if depth.ndim != 2 or depth.dtype.kind not in "fiu" or depth.size == 0:
         raise ValueError(f"depth: expected numbers (height, width), got {depth.dtype} {depth.shape}")
@@ -368,7 +390,7 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     except (ValueError, TypeError) as error:
         raise ValueError(f"K: {error}") from error
     unit = fields.get("depth_scale")
-    known = None if unit is None else depth_units.stated(float(unit), "depth_scale")
+    known = None if unit is None else depth_units.parse_scale(float(unit), "depth_scale")
     found = _metres(depth, reading, known)
     return RecordedFrame(
         reading.z(found.depth, camera), camera, labels, path.name, notes="; ".join(found.notes), encoding="32FC1"

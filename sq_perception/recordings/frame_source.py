@@ -82,7 +82,7 @@ class FrameSource:
         return replace(self.clean, depth=model.measured(self.clean.depth, self.clean.camera, self._noise))
 
 
-def generated(
+def generate(
     scene: Literal["thesis", "table"],
     seed: int,
     *,
@@ -108,7 +108,7 @@ def generated(
     return make
 
 
-def recorded(
+def read(
     paths: Sequence[Path], camera_info: Path | str | None, projection: Projection, *, with_labels: bool
 ) -> Maker:
     """Recorded frames one after the other."""

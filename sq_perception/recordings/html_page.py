@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sq_perception.files.output_file import OutputFile, named
+from sq_perception.files.output_file import OutputFile, name_in_errors
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.mesh import COLOURS
 from sq_perception.geometry.superquadric import Superquadric
@@ -49,7 +49,7 @@ class HtmlPage:
         content = {"name": f"{self._count}: {frame.name}", **_scene(frame, recovery), **_numbers(frame, recovery)}
         # Without "<" no text in it can end the script.
         text = json.dumps(content, allow_nan=False).replace("<", "\\u003c")
-        with named(self._output.path):
+        with name_in_errors(self._output.path):
             self._file.write(f"{'' if self._count else self._beginning}<script>frames.push({text});</script>\n")
         self._count += 1
 
@@ -58,7 +58,7 @@ class HtmlPage:
         if self._file.closed:
             return None
         try:
-            with named(self._output.path):
+            with name_in_errors(self._output.path):
                 with self._file:
                     self._file.write(self._end)
                 return self._output.commit(whole) if self._count else None
@@ -91,8 +91,8 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
         "points": {
             "low": low.tolist(),
             "step": step.tolist(),
-            "steps": _packed(np.rint((points - low) / step)),
-            "bodies": _packed(numbers[np.maximum(recovery.labels[rows, columns], 0)]),
+            "steps": _pack(np.rint((points - low) / step)),
+            "bodies": _pack(numbers[np.maximum(recovery.labels[rows, columns], 0)]),
         },
         "bodies": bodies,
         "colours": COLOURS[np.arange(len(recovery.bodies)) % len(COLOURS)].tolist(),
@@ -116,7 +116,7 @@ def _body(number: int, body: Superquadric, sigma_size: np.ndarray, up: np.ndarra
     }
 
 
-def _packed(values: np.ndarray) -> str:
+def _pack(values: np.ndarray) -> str:
     """Numbers as base64 of unsigned 16 bit, little endian."""
     return base64.b64encode(values.astype("<u2").tobytes()).decode()
 

@@ -63,7 +63,7 @@ class RecordedInput:
             # Auto depends on what the images are called.
             treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
             camera_file.read_calibration(self._options.camera_info, treatment, size=ANY_SIZE)
-        self._sources = [source for name in names for source in self._named(name)]
+        self._sources = [source for name in names for source in self._name(name)]
         self.total = len(self._sources)
         """Frames to expect; a bag counts as one until it is opened."""
 
@@ -88,7 +88,7 @@ class RecordedInput:
             else:
                 yield str(path), self._file(path, rest)
 
-    def _named(self, name: str) -> list[_Source]:
+    def _name(self, name: str) -> list[_Source]:
         if not name:  # a variable of a shell that is not set: the current folder is called "."
             return [(Path(), FrameError("expected the name of a file or folder, got an empty one"))]
         path = Path(name)

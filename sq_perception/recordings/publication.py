@@ -90,7 +90,7 @@ class Identified:
         return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)
 
 
-def identified(
+def identify(
     recovery: FrameRecovery, tracks: Sequence[Followed] | None = None, hidden: tuple[int, ...] = ()
 ) -> Identified:
     """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order.
@@ -160,7 +160,7 @@ class Findings:
         shown = self.array.recovered
         return tuple(triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(shown))
 
-    def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
+    def move(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
         """The same in another frame, p_new = R(rotation) p + translation; the stamp stays."""
         return Findings(
             array=poses.moved(self.array, rotation, translation),

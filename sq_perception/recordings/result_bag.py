@@ -120,7 +120,7 @@ class ResultBag:
         OSError
             If the disk is full; the file is then closed with what there is.
         """
-        found = publication.identified(recovery, tracks)
+        found = publication.identify(recovery, tracks)
         stamp = self._stamp(frame)
         received = frame.received if frame.received is not None else stamp.sec * _SECOND + stamp.nanosec
         shown = publication.findings(found, self._header(frame, stamp), frame.is_cube)

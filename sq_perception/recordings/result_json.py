@@ -194,7 +194,7 @@ class ResultLines:
         self.done: list[dict[str, Any]] = []
         beginning = _line(head(options))
         self._can_go_back = not output_file.is_stream(self._path)
-        self._descriptor = (output_file.opened if self._can_go_back else output_file.open_stream)(self._path)
+        self._descriptor = (output_file.open_locked if self._can_go_back else output_file.open_stream)(self._path)
         try:
             self._end = self._found(json.loads(beginning)) if self._can_go_back else 0
             if not self._end:
@@ -216,7 +216,7 @@ class ResultLines:
     def _put(self, data: bytes) -> None:
         rest = memoryview(data)
         try:
-            with output_file.named(self._path):
+            with output_file.name_in_errors(self._path):
                 while rest:
                     rest = rest[os.write(self._descriptor, rest) :]
         except BaseException:
@@ -255,7 +255,7 @@ class ResultLines:
 
     def _entry(self, number: int, line: bytes) -> dict[str, Any]:
         try:
-            entry = json.loads(line, parse_constant=_refused)
+            entry = json.loads(line, parse_constant=_refuse)
         except (ValueError, RecursionError) as error:
             raise ResumeError(f"{self._path}: line {number}: expected JSON: {error}") from error
         if not isinstance(entry, dict):
@@ -299,7 +299,7 @@ def _is_head(found: Mapping[str, Any], expected: Mapping[str, Any]) -> bool:
     return found.keys() == expected.keys() and all(found[name] == expected[name] for name in ("format", "version"))
 
 
-def _refused(constant: str) -> None:
+def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is no JSON")
 
 

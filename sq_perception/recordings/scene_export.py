@@ -8,7 +8,7 @@
 | curobo | ``.yml``, meshes in it | and capsule | https://curobo.org, ``curobo.geom.types.WorldConfig`` |
 
 Each body becomes the solid of the least volume that ENCLOSES it, or a mesh that does and fits closely: where a planner
-sees free space, no body is.  Bodies are not known exactly: :func:`grown` makes them larger by their deviations first.
+sees free space, no body is.  Bodies are not known exactly: :func:`inflate` makes them larger by their deviations first.
 Metres, in the frame that the bodies are given in; a URDF names that frame.
 
 A superquadric lies within the body of revolution whose radius is its largest one, and that within the capsule (segment
@@ -54,7 +54,7 @@ class Solid:
     mesh: tuple[np.ndarray, np.ndarray] | None = None
 
 
-def grown(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Superquadric:
+def inflate(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Superquadric:
     """Bodies (n,) whose faces lie ``sigmas`` standard deviations farther out, by their covariances (n, 11, 11).
 
     A face moves with the size and with the centre, whose errors belong together: each half size grows by the larger

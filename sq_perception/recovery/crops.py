@@ -10,7 +10,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.recovery.recovery import Recovery
-from sq_perception.recovery.workers import Processes, Setup, Work, recovered
+from sq_perception.recovery.workers import Processes, Setup, Work, recover_all
 
 
 def recover_crops(
@@ -57,7 +57,7 @@ def recover_crops(
         for depth, camera, mask in zip(depths, each, shown, strict=True)
     ]
     if jobs > 1:
-        answers = [answer for _, answer in recovered(enumerate(works), Processes(Setup(None, settings), jobs))]
+        answers = [answer for _, answer in recover_all(enumerate(works), Processes(Setup(None, settings), jobs))]
     else:
         recoverer = Recoverer(method=settings.method)
         answers = [recoverer.recover(work.depth, work.camera, work.labels, settings) for work in works]

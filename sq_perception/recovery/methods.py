@@ -30,22 +30,22 @@ _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
 """What numerical code may raise on degenerate data: reported with the object, never raised."""
 
 
-def fitted(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+def fit_view(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     """The body of an object by the chosen method; FAILED with a reason instead of any exception on hard data."""
     if obj.pixels < max(MIN_PIXELS, _LEAST_MEASURED * obj.masked):
         of_all = f" of {obj.masked}" if obj.pixels >= MIN_PIXELS else ""
-        return _failed(obj, f"{obj.pixels}{of_all} pixels with a depth are too few for a body")
+        return _failure(obj, f"{obj.pixels}{of_all} pixels with a depth are too few for a body")
     try:
         return _body(obj, depth, camera, options, deadline)
     except _HARD_IMAGE as error:  # a body that is not finite too
-        return _failed(obj, f"{options.method}: {error}")
+        return _failure(obj, f"{options.method}: {error}")
 
 
 def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(obj.points)
     if options.method == "network":
-        return _predicted(obj)
+        return _predict(obj)
     known = FitOptions(plane=obj.plane, time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET))
     if not options.free_space:
         depth = np.where(obj.mask, depth, np.float32(np.nan))
@@ -70,7 +70,7 @@ def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitO
     return surface_fit.fit(depth, obj.mask, camera, start=predicted, options=options)
 
 
-def _predicted(obj: SeenObject) -> Fit:
+def _predict(obj: SeenObject) -> Fit:
     """The prediction itself, with its distance from the points; nothing is known about its uncertainty."""
     if obj.prediction is None:
         raise ValueError("no prediction")
@@ -80,7 +80,7 @@ def _predicted(obj: SeenObject) -> Fit:
     return Fit(body, residual, Status.CONVERGED, "prediction of the network, not refined")
 
 
-def _failed(obj: SeenObject, reason: str) -> Fit:
+def _failure(obj: SeenObject, reason: str) -> Fit:
     points = obj.points
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))

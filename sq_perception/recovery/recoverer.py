@@ -152,7 +152,7 @@ class Recoverer:
         self._threads = threads or len(os.sched_getaffinity(0))
         self._options = RecoveryOptions(method=method)
         self._path = model
-        self._device = inference.checked_device(device)
+        self._device = inference.check_device(device)
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
         self._masks: CompactMasks | None = None if weights_of is None else weights_of._masks
         self._begin()
@@ -227,7 +227,7 @@ class Recoverer:
     ) -> Readings:
         """Check an image, parameters as in :meth:`recover`, and fill its small holes."""
         began = time.perf_counter()
-        measured = _measured(camera.readings(depth), camera)
+        measured = _measure(camera.readings(depth), camera)
         labels = None if labels is None else _masks(labels, measured)
         measured, labels, closed = hole_filling.filled(measured, labels)
         return Readings(measured, closed, camera, labels, options or self._options, began)
@@ -235,7 +235,7 @@ class Recoverer:
     def find_objects(self, readings: Readings, segmentation: segments.Segmentation | None = None) -> Found:
         """Segment an image; or take the segmentation of one that shows the same objects at the same pixels."""
         with self._at_work():
-            found = self._segmented(readings) if segmentation is None else segmentation
+            found = self._segment(readings) if segmentation is None else segmentation
             depth = _in_range(readings.depth, found.labels, readings.options.depth_range)
             return Found(found, depth, seen_object.objects(depth, found, readings.camera))
 
@@ -252,23 +252,23 @@ class Recoverer:
             outliers = found.segmentation.outliers
             objects = found.objects if outliers is None else [obj.without(outliers) for obj in found.objects]
 
-            def prepared(obj: SeenObject) -> SeenObject:
+            def prepare(obj: SeenObject) -> SeenObject:
                 plane = supports.support(obj, objects, depth, camera, found.segmentation, options)
                 obj = replace(obj, plane=plane)
                 if readings.labels is not None:
                     obj = seen_object.completed(obj, depth, camera, found.segmentation.labels)
                 return seen_object.viewed(obj, depth, camera, config)
 
-            fresh = self._mapped(prepared, [obj for obj in objects if obj.label not in known])
+            fresh = self._mapped(prepare, [obj for obj in objects if obj.label not in known])
             if network is not None:
-                fresh = self._predicted(fresh, network, options)
+                fresh = self._predict(fresh, network, options)
             predicted = time.perf_counter()
 
             if readings.closed is not None:  # what stands in for readings is none to a fit
                 depth = np.where(readings.closed, np.float32(np.nan), depth)
                 fresh = [obj.of_readings(depth, readings.closed, found.segmentation.labels) for obj in fresh]
             deadline = readings.began + options.time_budget
-            fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
+            fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), fresh)
             fitted = time.perf_counter()
 
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
@@ -304,7 +304,7 @@ class Recoverer:
         with one_blas_thread():
             yield
 
-    def _segmented(self, readings: Readings) -> segments.Segmentation:
+    def _segment(self, readings: Readings) -> segments.Segmentation:
         """The objects of an image: the given masks, or its own segments, which the network of masks improves where
         the network predicts hulls."""
         depth, camera, options = readings.depth, readings.camera, readings.options
@@ -321,7 +321,7 @@ class Recoverer:
             return None
         return self._load_network(readings.camera.is_pinhole and readings.options.method == "auto")
 
-    def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
+    def _predict(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; with ``auto``, bodies are predicted only once a fit asks for one."""
         views = [obj.shown for obj in objects if obj.shown is not None]
         if not views:
@@ -385,7 +385,7 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
     return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
 
 
-def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
+def _measure(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """float32, NaN for all that is no measurement; row by row, as kernels are compiled for arrays of a kind."""
     farthest = min(GREATEST_DEPTH, float(np.finfo(depth.dtype).max))  # which half precision does not reach
     within = (depth >= (LEAST_DEPTH if camera.is_pinhole else 0)) & (depth <= farthest)

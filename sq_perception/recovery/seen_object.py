@@ -154,7 +154,7 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
     mask, rows = names == obj.label, 0
     while rows < _MOST_ROWS:
         rim = (cv2.dilate(mask.view(np.uint8), depth_steps.CROSS) > 0) & ~mask
-        grown = depth_steps.grown(mask.astype(np.int32), free & rim, near, 1, depth_steps.STEP) > 0
+        grown = depth_steps.grow(mask.astype(np.int32), free & rim, near, 1, depth_steps.STEP) > 0
         if np.count_nonzero(grown & rim) <= _SURROUNDED * np.count_nonzero(rim):
             break
         mask, rows = grown, rows + 1

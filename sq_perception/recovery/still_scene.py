@@ -44,7 +44,7 @@ import numpy as np
 
 from sq_perception.fitting.fit import CUT_SHORT, Status
 from sq_perception.geometry.kernels import inline_kernel, kernel
-from sq_perception.geometry.quantiles import ranked
+from sq_perception.geometry.quantiles import select
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.imaging.regions import window as window_of
@@ -161,8 +161,8 @@ class StillScene:
 
 def follow(recoverer: Recoverer, readings: Readings, last: Reference | None) -> Reference:
     """Recover a frame, given the reference that the frame before left; returns what it leaves to the next."""
-    kept = NOTHING if last is None else repeated(last, readings)
-    seen, stride = sampled(readings.depth, readings.camera)
+    kept = NOTHING if last is None else repeat(last, readings)
+    seen, stride = sample(readings.depth, readings.camera)
     if last is not None and kept.segmentation is not None and len(kept.bodies) == len(last.recovery.bodies):
         bodies = tuple(replace(body, repeats=body.repeats + 1) for body in last.recovery.bodies)
         spent = 1e3 * (time.perf_counter() - readings.began)
@@ -171,13 +171,13 @@ def follow(recoverer: Recoverer, readings: Readings, last: Reference | None) -> 
             last, recovery=replace(last.recovery, bodies=bodies, milliseconds=milliseconds), age=last.age + 1
         )
     found = recoverer.find_objects(readings, kept.segmentation)
-    same = {} if last is None else matched(kept, last.recovery.labels, found.objects)
+    same = {} if last is None else match(kept, last.recovery.labels, found.objects)
     recovery = recoverer.recover_objects(readings, found, same)
     age = 0 if last is None or kept.segmentation is None else last.age + 1
     new = Reference(
         recovery, seen, stride, readings.camera, readings.options, found.segmentation, age, readings.labels is not None
     )
-    return new if last is None or not same else mixed(new, last, list(same))
+    return new if last is None or not same else mix(new, last, list(same))
 
 
 def warm_up() -> None:
@@ -185,11 +185,11 @@ def warm_up() -> None:
     readings = np.ones((2 * _BLOCK, 2 * _BLOCK), np.float32)
     shown = np.ones(readings.shape, np.int32)
     extents(shown)
-    _compared(readings, readings, shown, 1e-3)
+    _compare(readings, readings, shown, 1e-3)
     _moments(_around(shown == 1), 1e-3, np.zeros_like(readings), readings, readings, readings)
 
 
-def repeated(last: Reference, readings: Readings) -> Repeated:
+def repeat(last: Reference, readings: Readings) -> Repeated:
     """The bodies and segments of the frame before that hold for an image.
 
     Segments repeat only where given masks do, or where none were given to either.
@@ -199,9 +199,9 @@ def repeated(last: Reference, readings: Readings) -> Repeated:
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new = last.depth, sampled(readings.depth, camera)[0]
+    old, new = last.depth, sample(readings.depth, camera)[0]
     shown = np.ascontiguousarray(previous.labels[:: last.stride, :: last.stride], dtype=np.int32)
-    compared = _compared(old, new, shown, last.segmentation.sigma)
+    compared = _compare(old, new, shown, last.segmentation.sigma)
     if compared is None:
         return NOTHING
     change, patches, level, share = compared
@@ -232,7 +232,7 @@ def repeated(last: Reference, readings: Readings) -> Repeated:
     return Repeated(kept, last.segmentation if repeats else None)
 
 
-def _compared(
+def _compare(
     old: np.ndarray, new: np.ndarray, shown: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, float, float] | None:
     """What changed between two images (rows, columns), in levels of their noise; None where the camera has moved.
@@ -242,16 +242,16 @@ def _compared(
     """
     reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
-    spread = ranked(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
+    spread = select(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
     if spread > _NOISIER * sigma:
         return None
     level = max(spread, 0.5 * sigma)
     patches, sums = _in_noise_levels(change, old, new, level, reach)
-    share = max((ranked(sums, 3 * sums.size // 4) / _QUARTILE / _BLOCK) ** 2, 1.0) if sums.size else 1.0
+    share = max((select(sums, 3 * sums.size // 4) / _QUARTILE / _BLOCK) ** 2, 1.0) if sums.size else 1.0
     return None if share > _SHARED else (change, patches, level, share)
 
 
-def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -> dict[int, Recovery]:
+def match(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -> dict[int, Recovery]:
     """The repeated bodies of a new frame's objects, by their new labels.
 
     ``labels`` are those of the frame before; a body whose object is segmented otherwise now is left out.
@@ -268,7 +268,7 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
     return same
 
 
-def sampled(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
+def sample(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
     """The readings of an image (height, width) that are compared, float32, and their stride in pixels.
 
     The image is NaN where nothing was measured, the readings are 0 there.
@@ -278,7 +278,7 @@ def sampled(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
     return np.where(np.isnan(seen), np.float32(0), seen), stride
 
 
-def mixed(new: Reference, old: Reference, kept: Sequence[int]) -> Reference:
+def mix(new: Reference, old: Reference, kept: Sequence[int]) -> Reference:
     """The new reference, with the old readings around the labels that were recovered from these."""
     labels, taken = new.recovery.labels[:: new.stride, :: new.stride], np.zeros(new.depth.shape, bool)
     for label in kept:

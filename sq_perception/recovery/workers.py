@@ -1,12 +1,10 @@
-"""Frames recovered by several processes at a time, of this machine or of a Dask cluster, answered in their order.
+"""Recover frames in several processes and return the results in order.
 
-Each process has a Recoverer of its own, of one thread.  A few frames a process are under way, so that none waits while
-results are written, and that no more are read than that.  Where a process dies, killed or out of memory, a new one
-begins, and its frame is begun again when its turn comes; it is given up after some tries.  A cluster's scheduler does
-the same by itself.
+Each process has a Recoverer with one thread.  A few frames per process are under way at a time, which bounds memory.
+If a process dies (killed, or out of memory), another one starts and its frame is tried again, a few times.
 
-Each process has a pipe of its own.  Those of :class:`concurrent.futures.ProcessPoolExecutor` share one: killed while it
-writes an answer, a process leaves all others, and who asked them, waiting for ever.
+Each process has a pipe of its own.  Those of :class:`concurrent.futures.ProcessPoolExecutor` share one: a process that
+is killed while it writes an answer leaves all the others, and their caller, waiting for ever.
 """
 
 from __future__ import annotations
@@ -39,7 +37,6 @@ AHEAD = 3
 TRIES = 3
 """Deaths of its process after which a frame is given up: one may be an operator's, or another frame's memory."""
 
-_one_at_a_time = threading.Lock()
 _Key = TypeVar("_Key")
 _Answer: TypeAlias = "Future[FrameRecovery | None]"
 
@@ -70,8 +67,8 @@ class WorkerLostError(RuntimeError):
     """The processes that worked on a frame died, again and again."""
 
 
-def recovered(
-    frames: Iterable[tuple[_Key, Work | None]], executor: Processes | Cluster
+def recover_all(
+    frames: Iterable[tuple[_Key, Work | None]], executor: Processes
 ) -> Iterator[tuple[_Key, FrameRecovery | Exception | None]]:
     """The key of each frame, in their order, with its recovery or the exception that it raised, None for no work.
 
@@ -91,10 +88,10 @@ def recovered(
         deaths = 0
         while True:
             try:
-                return key, _unpacked(answer.result())
-            except executor.lost:
+                return key, _unpack(answer.result())
+            except _LostError:
                 deaths += 1
-                if deaths == executor.tries:
+                if deaths == TRIES:
                     return key, WorkerLostError("the process that recovered it died, again and again")
                 answer = begun(work)
             except Exception as error:  # whatever it raised there is for the caller
@@ -113,9 +110,6 @@ def recovered(
 
 class Processes:
     """``size`` processes, each asked by a thread of its own; another one begins where one died."""
-
-    lost: type[Exception] = _LostError
-    tries = TRIES
 
     def __init__(self, setup: Setup, size: int) -> None:
         self._setup, self.size = setup, size
@@ -143,7 +137,7 @@ class Processes:
             if self._ended:
                 raise _LostError
             if thread not in self._of_thread:
-                self._of_thread[thread] = _started(self._setup)
+                self._of_thread[thread] = _start(self._setup)
             process, pipe = self._of_thread[thread]
         try:
             pipe.send(work)
@@ -159,47 +153,7 @@ class Processes:
         return cast(FrameRecovery, answer)
 
 
-class Cluster:
-    """The workers of a running Dask cluster, which have this package and, at the same path, a model that is named.
-
-    What is sent there is pickled: whoever reaches a scheduler can run programs on its workers.
-
-    Raises
-    ------
-    ImportError
-        Without ``distributed``, the extra 'cluster'.
-    OSError, ValueError
-        If nothing answers at the address, or it is none.
-    """
-
-    tries = 1  # for a scheduler that has tried ``distributed.scheduler.allowed-failures`` times
-
-    def __init__(self, setup: Setup, address: str) -> None:
-        try:
-            import distributed
-        except ModuleNotFoundError as error:
-            raise ImportError(
-                f"a cluster needs the module {error.name!r}: pip install 'sq_perception[cluster]'"
-            ) from error
-        distributed.comm.get_address_host_port(address)  # a client that cannot read its own hangs in the end
-        self._setup, self.lost = setup, distributed.KilledWorker
-        self._client = distributed.Client(address, set_as_default=False)
-
-    @property
-    def size(self) -> int:
-        """Processes at the moment; one where none has come yet."""
-        return max(1, len(self._client.nthreads()))
-
-    def ask(self, work: Work) -> _Answer:
-        # Frames alike are frames all the same: none is answered by the result of another one.
-        # distributed's future behaves as the standard library's, but is none by inheritance.
-        return cast(_Answer, self._client.submit(_recover, self._setup, work, pure=False))
-
-    def end(self) -> None:
-        self._client.close()
-
-
-def _started(setup: Setup) -> tuple[BaseProcess, Connection]:
+def _start(setup: Setup) -> tuple[BaseProcess, Connection]:
     """A process, and this end of its pipe; Ctrl-C is for the one that asks."""
     # Not forked: a process that has threads of BLAS and numba cannot be copied.
     context = multiprocessing.get_context("spawn")
@@ -240,16 +194,14 @@ def _recoverer(setup: Setup) -> Recoverer:
 
 
 def _recover(setup: Setup, work: Work) -> FrameRecovery:
-    with _one_at_a_time:  # workers of a cluster may have several threads
-        found = _recoverer(setup).recover(work.depth, work.camera, work.labels, work.options)
-    return _packed(found)
+    return _pack(_recoverer(setup).recover(work.depth, work.camera, work.labels, work.options))
 
 
-def _packed(found: FrameRecovery) -> FrameRecovery:
+def _pack(found: FrameRecovery) -> FrameRecovery:
     """A recovery as it is sent: labels in as few bytes as they need."""
     labels = found.labels.astype(np.min_scalar_type(found.labels.max(initial=0)))
     return replace(found, labels=labels)
 
 
-def _unpacked(found: FrameRecovery | None) -> FrameRecovery | None:
+def _unpack(found: FrameRecovery | None) -> FrameRecovery | None:
     return None if found is None else replace(found, labels=found.labels.astype(np.int32))

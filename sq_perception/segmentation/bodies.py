@@ -53,7 +53,7 @@ def above(
     camera = camera.cropped(left, top, known.shape[1], known.shape[0])
     inside = taken_apart(known, clear, camera, support.sigma)
     foot = raised[window] & (inside == 0)
-    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
+    labels[window] = depth_steps.grow(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
 
 
@@ -74,7 +74,7 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
     least = _LEAST_AREA * camera.fx * camera.fy / quantile(some, 0.5) ** 2
     inner = (wanted & ~depth_steps.edges(filled, wanted, depth_steps.STEP)).view(np.uint8)
     labels = _large(depth_steps.components(cv2.morphologyEx(inner, cv2.MORPH_OPEN, depth_steps.CROSS)), least)
-    labels = depth_steps.grown(labels, wanted & (labels == 0), depth, _GROWN, depth_steps.STEP)
+    labels = depth_steps.grow(labels, wanted & (labels == 0), depth, _GROWN, depth_steps.STEP)
     left = wanted & (labels == 0)
     if np.count_nonzero(left) < least:
         return labels
@@ -87,4 +87,4 @@ def _large(labels: np.ndarray, least: float) -> np.ndarray:
     """The labels with at least so many pixels, or the largest of them if there are very many, renumbered from 1."""
     counts = regions.extents(labels)[:, 0]
     kept = counts >= max(least, np.sort(counts)[-_MOST:][0])
-    return regions.renumbered(labels, (kept * np.cumsum(kept)).astype(np.int32))
+    return regions.renumber(labels, (kept * np.cumsum(kept)).astype(np.int32))

@@ -90,7 +90,7 @@ def corrected(
         group = convex_pieces.linked(crossed, np.array([len(part.z) for part in parts], float), AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
-    return regions.renumbered(image.labels, number_of)
+    return regions.renumber(image.labels, number_of)
 
 
 def warm_up() -> None:

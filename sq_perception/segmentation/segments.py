@@ -170,7 +170,7 @@ def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
     number[order] = np.arange(len(order)) + 1
     return replace(
         found,
-        labels=regions.renumbered(found.labels, number),
+        labels=regions.renumber(found.labels, number),
         ids=tuple(range(1, len(order) + 1)),
         objectness=tuple(likely[label] for label in order),
     )

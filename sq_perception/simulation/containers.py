@@ -18,13 +18,13 @@ from sq_perception.simulation.thing import (
     Row,
     Thing,
     about,
-    assembled,
+    assemble,
     log_uniform,
     part,
 )
 
 _OVERLAP, _EDGE = 0.56, 0.1
-"""Half height of the slabs that revolved things are stacked of, in their distance, and e1: where two meet, the surface
+"""Half height of the slabs that revolved objects are stacked of, in their distance, and e1: where two meet, the surface
 is 0.6 % nearer to the axis."""
 _LEVELS = 100
 """At which a cavity is looked at."""
@@ -33,7 +33,8 @@ _NARROW = 0.3
 
 
 def bottle(rng: np.random.Generator) -> Thing:
-    """Round and oval bottles: body, shoulders, neck; cap, nozzle, pump or trigger; sometimes a waist or a handle."""
+    """Make a round or oval bottle: body, shoulders, neck; cap, nozzle, pump or trigger; sometimes a waist or a
+    handle."""
     oval = rng.random() < 0.55
     flat = rng.uniform(0.4, 0.92) if oval else 1.0
     e2 = rng.uniform(0.3, 1.0) if oval or rng.random() < 0.15 else 1.0
@@ -56,11 +57,11 @@ def bottle(rng: np.random.Generator) -> Thing:
     rows += _closure(rng, a, b, straight, height)
     if oval and height > 0.16 and rng.random() < 0.18:
         rows += _grip(rng, a, straight, height)
-    return assembled("bottle", "oval bottle" if flat < 1 else "round bottle", rows, OVAL_RESTS if oval else ROUND_RESTS)
+    return assemble("bottle", "oval bottle" if flat < 1 else "round bottle", rows, OVAL_RESTS if oval else ROUND_RESTS)
 
 
 def _shoulders(rng: np.random.Generator, a: float, b: float, e2: float, low: float, high: float) -> list[Row]:
-    """The parts between the straight body, which ends at the height ``low``, and the neck at ``high``."""
+    """Return the parts between the straight body, which ends at the height ``low``, and the neck at ``high``."""
     rise = high - low
     round_e2 = max(e2, rng.uniform(0.7, 1.0))
     if rng.random() < 0.6:  # a dome
@@ -79,7 +80,7 @@ def _shoulders(rng: np.random.Generator, a: float, b: float, e2: float, low: flo
 
 
 def _closure(rng: np.random.Generator, a: float, b: float, low: float, top: float) -> list[Row]:
-    """The neck, from within the shoulders at the height ``low`` to ``top``, and what closes it above."""
+    """Return the neck, from within the shoulders at the height ``low`` to ``top``, and its closure."""
     radius = min(rng.uniform(0.024, 0.05) / 2, 0.95 * b)
     tall = rng.uniform(0.012, 0.045)
     aside = rng.uniform(-0.35, 0.35) * a if rng.random() < 0.12 else 0.0
@@ -126,7 +127,7 @@ def _closure(rng: np.random.Generator, a: float, b: float, low: float, top: floa
 
 
 def _grip(rng: np.random.Generator, a: float, straight: float, height: float) -> list[Row]:
-    """The handle of a jug, beside its shoulder."""
+    """Return the handle of a jug, beside its shoulder."""
     thick, out = rng.uniform(0.008, 0.014), a * rng.uniform(0.75, 1.05)
     low, high = straight * rng.uniform(0.55, 0.8), height * rng.uniform(0.88, 0.98)
     tall = high - low
@@ -137,7 +138,7 @@ def _grip(rng: np.random.Generator, a: float, straight: float, height: float) ->
 
 
 def tube(rng: np.random.Generator) -> Thing:
-    """Squeeze tubes: round at the cap, flat at the crimp; they lie, or stand on the cap."""
+    """Make a squeeze tube: round at the cap, flat at the crimp; it lies, or stands on the cap."""
     radius, long = rng.uniform(0.02, 0.055) / 2, rng.uniform(0.07, 0.2)
     flat = np.linspace(0.95, rng.uniform(0.1, 0.35), 5)
     rows = [
@@ -146,11 +147,11 @@ def tube(rng: np.random.Generator) -> Thing:
     ]
     cap, tall = radius * rng.uniform(0.55, 1.0), rng.uniform(0.01, 0.03)
     rows.append(part((cap, cap, tall / 2), (0.15, 1.0), (0, 0, -tall / 2)))
-    return assembled("bottle", "tube", rows, (("lying", ON_Y, 0.75), ("standing", UPRIGHT, 0.25)))
+    return assemble("bottle", "tube", rows, (("lying", ON_Y, 0.75), ("standing", UPRIGHT, 0.25)))
 
 
-def _revolved(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
-    """A stack of slabs with these radii from the base to the top."""
+def _revolve(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
+    """Return a stack of slabs with these radii from the base to the top."""
     count = len(radii)
     return [
         part((r, flat * r, _OVERLAP * height / count), (_EDGE, e2), (0, 0, height * (k + 0.5) / count))
@@ -159,7 +160,7 @@ def _revolved(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0)
 
 
 def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
-    """The widest of some superquadrics about the middle of the rim that stays within a stack of slabs; none if narrow.
+    """Return the widest of some superquadrics at the rim that stays within a stack of slabs; none if it is narrow.
 
     At the height z a superquadric of the half height h has the radius a (1 - |z / h|^(2 / e1))^(e1 / 2).
     """
@@ -180,13 +181,13 @@ def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat
 
 
 def cup(rng: np.random.Generator) -> Thing:
-    """Cups, tumblers and mugs, straight or tapered."""
+    """Make a cup, tumbler or mug, straight or tapered."""
     top, height = rng.uniform(0.055, 0.1) / 2, rng.uniform(0.05, 0.15)
     bottom = top * (1.0 if rng.random() < 0.45 else rng.uniform(0.6, 0.95))
     wall = rng.uniform(0.002, 0.006)
     count = 1 if bottom == top else 6
     radii = np.linspace(bottom, top, count + 2)[1:-1]
-    rows = _revolved(radii, height)
+    rows = _revolve(radii, height)
     cut = _cavity(radii, height, wall)
     name = "cup"
     if rng.random() < 0.55:
@@ -200,29 +201,29 @@ def cup(rng: np.random.Generator) -> Thing:
             slope = np.rad2deg(np.arctan2(out * s, tall * c))
             rows.append(part((thick * 0.8, thick, along), (0.6, 0.8), where, about(1, -slope)))
     rests = (("standing", UPRIGHT, 0.8), ("lying", ON_X if name == "cup" else ON_Y, 0.12), ("inverted", INVERTED, 0.08))
-    return assembled("vessel", name, rows, rests, cut)
+    return assemble("vessel", name, rows, rests, cut)
 
 
 def bowl(rng: np.random.Generator) -> Thing:
-    """Bowls, deep plates and plates: they widen upwards."""
+    """Make a bowl, deep plate or plate that widens upwards."""
     top = log_uniform(rng, 0.09, 0.28) / 2
     height = min(2 * top * rng.uniform(0.07, 0.6), 0.12)
     foot = top * rng.uniform(0.4, 0.7)
     count = 4 if height < 0.03 else 8
     share = (np.arange(count) + 0.75) / count
     radii = foot + (top - foot) * share ** rng.uniform(0.4, 0.9)
-    rows = _revolved(radii, height)
+    rows = _revolve(radii, height)
     cut = _cavity(radii, height, rng.uniform(0.003, 0.006))
-    return assembled("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
+    return assemble("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
 
 
 def tub(rng: np.random.Generator) -> Thing:
-    """Tubs and pots, round or softly square, often with a lid that reaches out."""
+    """Make a tub or pot, round or softly square, often with a wider lid."""
     top, height = rng.uniform(0.06, 0.2) / 2, rng.uniform(0.03, 0.14)
     bottom = top * rng.uniform(0.7, 1.0)
     e2, flat = (1.0, 1.0) if rng.random() < 0.6 else (rng.uniform(0.15, 0.6), rng.uniform(0.55, 1.0))
     radii = np.linspace(bottom, top, 6)[1:-1]
-    rows = _revolved(radii, height, e2, flat)
+    rows = _revolve(radii, height, e2, flat)
     lid = rng.uniform(0.003, 0.01)
     cut: list[Row] = []
     if rng.random() < 0.7:
@@ -230,4 +231,4 @@ def tub(rng: np.random.Generator) -> Thing:
     else:
         cut = _cavity(radii, height, 0.004, e2, flat)
     rests = (("standing", UPRIGHT, 0.85), ("inverted", INVERTED, 0.08), ("on its side", ON_Y, 0.07))
-    return assembled("vessel", "tub", rows, rests, cut)
+    return assemble("vessel", "tub", rows, rests, cut)

@@ -1,4 +1,4 @@
-"""Crowds: random superquadrics on a table that lean on each other and hide each other.
+"""Crowds: random superquadrics on a table that touch and occlude each other.
 
 Most bodies are pushed along the table against another one until they touch.  Convex bodies A and B overlap where a
 point of one's surface lies inside the other; the push ends where no sampled point does any more.
@@ -28,8 +28,8 @@ _CONTACT = 2e-4
 _SURFACE_SAMPLES = 1500
 
 
-def crowded_scene(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
-    """``count`` random bodies on a table seen from 0.5 to 1.2 m, most touching another one, wholly inside the image.
+def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
+    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def crowded_scene(rng: np.random.Generator, count: int, camera: Camera = TABLE_C
                 continue
             body = _Placed.of(drawn, rng)
             if bodies and rng.random() < PUSHED:
-                body = _pushed(body, bodies[rng.integers(len(bodies))], plane[:3])
+                body = _push(body, bodies[rng.integers(len(bodies))], plane[:3])
             if not any(map(body.overlaps, bodies)) and inside_image(body.body, camera):
                 bodies.append(body)
             if len(bodies) == count:
@@ -66,7 +66,7 @@ class _Placed:
     def of(cls, body: Superquadric, rng: np.random.Generator) -> _Placed:
         return cls(body, body.sample_surface(_SURFACE_SAMPLES, rng, oversampling=2))
 
-    def moved(self, by: np.ndarray) -> _Placed:
+    def move(self, by: np.ndarray) -> _Placed:
         return _Placed(self.body.transformed(np.array([0.0, 0.0, 0.0, 1.0]), by), self.surface + by)
 
     def overlaps(self, other: _Placed) -> bool:
@@ -77,8 +77,8 @@ class _Placed:
         return bool((self.body.gauge(other.surface) < 1).any() or (other.body.gauge(self.surface) < 1).any())
 
 
-def _pushed(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
-    """The body moved along the table, straight towards the other one or away from it, until they just touch."""
+def _push(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
+    """Push a body along the table, straight towards the other one or away from it, until they just touch."""
     way = body.body.translation - other.body.translation
     way = way - (way @ normal) * normal
     length = float(np.linalg.norm(way))
@@ -86,5 +86,5 @@ def _pushed(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
     near, far = -length, float(np.linalg.norm(body.body.size) + np.linalg.norm(other.body.size))
     while far - near > _CONTACT:
         middle = 0.5 * (near + far)
-        near, far = (middle, far) if body.moved(middle * way).overlaps(other) else (near, middle)
-    return body.moved(far * way)
+        near, far = (middle, far) if body.move(middle * way).overlaps(other) else (near, middle)
+    return body.move(far * way)

@@ -1,15 +1,15 @@
-"""Household things in and on furniture: what carries them is no table.
+"""Household objects in and on furniture, instead of on a plain table.
 
-| | the plane that things stand on is | beside it |
+| | the plane that objects stand on is | beside it |
 | --- | --- | --- |
 | carton | the top of a box 8 to 40 cm high | the floor |
 | stool | the top of a board on four legs, 25 to 60 cm high | the floor |
 | shelf board | the top of a board 2 cm thick | a wall right behind it, the floor 0.5 to 1.5 m below |
 | shelves | the same | a back, two sides, a board above and one below, the floor |
-| tray | the table | four walls 1.5 to 5 cm high around the things |
+| tray | the table | four walls 1.5 to 5 cm high around the objects |
 | bin | the table | four walls 8 to 30 cm high |
 
-A carton is a thing as well, seen where its label is, though not one that was placed; all other furniture is none.
+A carton counts as an object too, where its label is visible, though it was not placed; other furniture does not.
 Metres, optical frame.
 """
 
@@ -29,24 +29,24 @@ from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable
 
 _SHARP = 0.02
 _MARGIN = (0.02, 0.12)
-"""Metres of free board around all things."""
+"""Metres of free board around all objects."""
 _TRIES = 20
 
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """The smallest rectangle around all things along some direction, and a margin.
+    """The smallest rectangle around all objects along some direction, and a margin.
 
     Attributes
     ----------
     axes : (3, 3)
         Columns: along its sides, and up.  The second one leads away from the camera.
     middle : (3,)
-        On the plane that things stand on.
+        On the plane that objects stand on.
     half : (2,)
         Half its sides.
     height
-        Height of the highest thing, metres.
+        Height of the highest object, metres.
     """
 
     axes: np.ndarray
@@ -67,7 +67,7 @@ class _Place:
         return cls(axes, middle, (high - low)[:2] / 2, float(high[2] - ground))
 
     def box(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> Superquadric:
-        """A box between two corners, which count from the middle."""
+        """Return a box between two corners, relative to the middle."""
         below, above = np.array(low), np.array(high)
         centre = self.middle + self.axes @ (below + above) / 2
         return Superquadric((above - below) / 2, np.full(2, _SHARP), centre, quaternions.from_matrix(self.axes))
@@ -83,7 +83,7 @@ class _Place:
 
 
 _Parts = tuple[list[Superquadric], float]
-"""Parts of a piece of furniture, and how far below the things the floor is."""
+"""Parts of a piece of furniture, and how far below the objects the floor is."""
 
 
 def _carton(place: _Place, rng: np.random.Generator) -> _Parts:
@@ -125,8 +125,8 @@ def _bin(place: _Place, rng: np.random.Generator) -> _Parts:
 
 @dataclass(frozen=True)
 class _Kind:
-    """A kind of furniture: its parts, the most things on it, how many degrees the camera is above it, by how many
-    radians it is turned at most, and whether it is a thing itself."""
+    """A kind of furniture: its parts, the most objects on it, the camera's elevation in degrees, its largest turn in
+    radians, and whether it is an object itself."""
 
     parts: Callable[[_Place, np.random.Generator], _Parts]
     most: int
@@ -147,25 +147,25 @@ KINDS = tuple(_KINDS)
 
 
 def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:
-    """Things in or on a piece of furniture, one of ``KINDS``; those that it hides altogether are left out.
+    """Draw objects in or on a piece of furniture, one of ``KINDS``; hidden ones are left out.
 
     ``plane`` is the one that they stand on.
 
     Raises
     ------
     ValueError
-        If the things find no room in the camera's image, or the furniture hides all of them again and again.
+        If the objects find no room in the camera's image, or the furniture hides all of them again and again.
     """
     kind = _KINDS[name]
     for _ in range(_TRIES):
         scene = things_on_table(rng, int(rng.integers(1, kind.most + 1)), camera, kind.elevation)
-        seen = _furnished(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng), kind.is_thing)
+        seen = _furnish(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng), kind.is_thing)
         if seen.placed:
             return seen
     raise ValueError(f"things in {name}: none is in sight")
 
 
-def _furnished(scene: ThingsOnTable, parts: list[Superquadric], down: float, is_thing: bool) -> ThingsOnTable:
+def _furnish(scene: ThingsOnTable, parts: list[Superquadric], down: float, is_thing: bool) -> ThingsOnTable:
     furniture, _ = raycast.render(Superquadric.stack(parts), scene.camera)
     beyond = np.minimum(plane_depth(scene.plane + np.array([0, 0, 0, down]), scene.camera), scene.wall)
     behind = np.minimum(furniture, beyond)

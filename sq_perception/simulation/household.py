@@ -1,8 +1,8 @@
-"""Household things as they are: unions of superquadrics of household proportions.
+"""Household objects: unions of superquadrics of household proportions.
 
-A :class:`~sq_perception.simulation.thing.Thing` is drawn by its kind; bottles and vessels have a module of their own.
+A :class:`~sq_perception.simulation.thing.Thing` is drawn by its kind; bottles and vessels have their own module.
 
-Families and their measures (ranges are wider than the sources: things differ)
+Families and their measures (ranges are wider than the sources: objects differ)
 ------------------------------------------------------------------------------
 | kind | what | measures |
 | --- | --- | --- |
@@ -17,7 +17,7 @@ Families and their measures (ranges are wider than the sources: things differ)
 
 Sources: EN 10333 and the can makers' common diameters (52, 53, 58, 66, 73, 83, 99 mm), ISBT finishes of PET bottles
 (PCO 1881, 38 mm), 0.25 to 2 l bottles of water, oil, cleaner and shampoo as sold, ISO 216, ISO 12757 (pens), UNECE
-standards for fruit, table ware of hotel catalogues.  No object of a benchmark is among them.
+standards for fruit, table ware of hotel catalogues.  Benchmark objects are not among them.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from sq_perception.simulation.thing import (
     UPRIGHT,
     Thing,
     about,
-    assembled,
+    assemble,
     log_uniform,
     one_of,
     part,
@@ -46,7 +46,7 @@ KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
 
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
-    """A random thing, of one of the given kinds or of any.
+    """Draw a random object, of one of the given kinds or of any.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> 
 
 
 def _carton(rng: np.random.Generator) -> Thing:
-    """Depth, width, height in any order of length; edges from sharp to soft."""
+    """Make a carton: depth, width, height in any order of length; edges from sharp to soft."""
     longest = log_uniform(rng, 0.045, 0.34)
     middle = longest * rng.uniform(0.3, 1.0)
     shortest = max(middle * log_uniform(rng, 0.12, 1.0), 0.012)
@@ -69,27 +69,27 @@ def _carton(rng: np.random.Generator) -> Thing:
     if rng.random() < 0.4:
         edges = edges[rng.permutation(3)]
     soft = 0.03 + 0.3 * rng.random(2) ** 2
-    return assembled("box", "carton", [part(edges / 2, soft)], CARTON_RESTS)
+    return assemble("box", "carton", [part(edges / 2, soft)], CARTON_RESTS)
 
 
 def _book(rng: np.random.Generator) -> Thing:
-    """ISO 216 formats and trade formats near them; 5 to 50 mm thick."""
+    """Make a book in ISO 216 or similar trade formats, 5 to 50 mm thick."""
     height = rng.choice([0.297, 0.21, 0.148, 0.25]) * rng.uniform(0.9, 1.1)
     size = np.array([rng.uniform(0.005, 0.05), height * rng.uniform(0.6, 0.8), height]) / 2
     rests = (("flat", ON_X, 0.8), ("standing", UPRIGHT, 0.2))
-    return assembled("box", "book", [part(size, rng.uniform(0.02, 0.1, 2))], rests)
+    return assemble("box", "book", [part(size, rng.uniform(0.02, 0.1, 2))], rests)
 
 
 def _soap(rng: np.random.Generator) -> Thing:
-    """Bars, erasers, bricks of wood or foam: small and softer."""
+    """Make a bar of soap, eraser, or brick of wood or foam: small and softer."""
     longest = log_uniform(rng, 0.03, 0.14)
     edges = longest * np.array([rng.uniform(0.2, 0.7), rng.uniform(0.4, 1.0), 1.0])
     shape = rng.uniform(0.1, 0.5, 2)
-    return assembled("box", "bar", [part(edges / 2, shape)], (("flat", ON_X, 0.6), *CARTON_RESTS))
+    return assemble("box", "bar", [part(edges / 2, shape)], (("flat", ON_X, 0.6), *CARTON_RESTS))
 
 
 def _tin(rng: np.random.Generator) -> Thing:
-    """Drink and food cans, flat tins, drums of powder: the makers' diameters, any height."""
+    """Make a drink or food can, flat tin or drum of powder: the makers' diameters, any height."""
     radius = float(rng.choice([0.052, 0.053, 0.058, 0.066, 0.073, 0.083, 0.099])) / 2 * rng.uniform(0.9, 1.1)
     if rng.random() < 0.35:
         radius = log_uniform(rng, 0.045, 0.13) / 2
@@ -108,11 +108,11 @@ def _tin(rng: np.random.Generator) -> Thing:
         for inner, z in ((end, top), (radius, -height / 2)):
             inner -= rng.uniform(0.0015, 0.0035)
             cut.append(part((inner, inner, rng.uniform(0.003, 0.007)), (0.1, 1.0), (0, 0, z)))
-    return assembled("can", "tin", rows, ROUND_RESTS, cut)
+    return assemble("can", "tin", rows, ROUND_RESTS, cut)
 
 
 def _spray_can(rng: np.random.Generator) -> Thing:
-    """Aerosols: 35 to 66 mm wide, dome and cap."""
+    """Make an aerosol can, 35 to 66 mm wide, with dome and cap."""
     radius, height = rng.uniform(0.035, 0.068) / 2, rng.uniform(0.1, 0.25)
     cap, tall = rng.uniform(0.45, 0.98) * radius, rng.uniform(0.015, 0.06)
     dome = rng.uniform(0.3, 0.8) * radius
@@ -121,11 +121,11 @@ def _spray_can(rng: np.random.Generator) -> Thing:
         part((0.97 * radius, 0.97 * radius, dome), (rng.uniform(0.6, 1.0), 1.0), (0, 0, height / 2)),
         part((cap, cap, tall / 2), (rng.uniform(0.08, 0.5), 1.0), (0, 0, height / 2 + 0.6 * dome + 0.3 * tall)),
     ]
-    return assembled("can", "spray can", rows, ROUND_RESTS)
+    return assemble("can", "spray can", rows, ROUND_RESTS)
 
 
 def _jar(rng: np.random.Generator) -> Thing:
-    """Jars with lids, round or softly square."""
+    """Make a jar with a lid, round or softly square."""
     radius = rng.uniform(0.045, 0.12) / 2
     height = 2 * radius * rng.uniform(0.5, 1.9)
     e2 = 1.0 if rng.random() < 0.75 else rng.uniform(0.3, 0.8)
@@ -135,11 +135,11 @@ def _jar(rng: np.random.Generator) -> Thing:
         part((radius, radius, height / 2), (rng.uniform(0.1, 0.45), e2)),
         part((lid, lid, tall / 2), (rng.uniform(0.05, 0.25), 1.0), (0, 0, height / 2 + tall * rng.uniform(0.2, 0.48))),
     ]
-    return assembled("can", "jar", rows, ROUND_RESTS)
+    return assemble("can", "jar", rows, ROUND_RESTS)
 
 
 def _roll(rng: np.random.Generator) -> Thing:
-    """Rolls of paper, tape, foil, biscuits."""
+    """Make a roll of paper, tape, foil or biscuits."""
     if rng.random() < 0.5:
         radius, height = rng.uniform(0.08, 0.14) / 2, rng.uniform(0.09, 0.26)
     elif rng.random() < 0.5:
@@ -147,11 +147,11 @@ def _roll(rng: np.random.Generator) -> Thing:
     else:
         radius, height = rng.uniform(0.03, 0.07) / 2, rng.uniform(0.12, 0.32)
     rests = (("standing", UPRIGHT, 0.5), ("lying", ON_Y, 0.5))
-    return assembled("can", "roll", [part((radius, radius, height / 2), (rng.uniform(0.03, 0.3), 1.0))], rests)
+    return assemble("can", "roll", [part((radius, radius, height / 2), (rng.uniform(0.03, 0.3), 1.0))], rests)
 
 
 def _fruit(rng: np.random.Generator) -> Thing:
-    """Fruit, balls, eggs: near to ellipsoids."""
+    """Make a fruit, ball or egg: nearly an ellipsoid."""
     radius = log_uniform(rng, 0.03, 0.12) / 2
     size = radius * np.array([1.0, rng.uniform(0.9, 1.0), rng.uniform(0.75, 1.45)])
     rows = [part(size, rng.uniform(0.8, 1.0, 2))]
@@ -161,11 +161,11 @@ def _fruit(rng: np.random.Generator) -> Thing:
     elif choice < 0.35:  # the tips of a lemon
         rows.append(part((0.3 * radius, 0.3 * radius, 1.2 * size[2]), (0.9, 1.0)))
     rests = (("standing", UPRIGHT, 0.5), ("lying", ON_X, 0.25), ("on its side", ON_Y, 0.25))
-    return assembled("round", "fruit", rows, rests)
+    return assemble("round", "fruit", rows, rests)
 
 
-def _bent(rng: np.random.Generator) -> Thing:
-    """Bananas and other bent things: an arc of ellipsoids in the xz plane; they lie on a side."""
+def _bend(rng: np.random.Generator) -> Thing:
+    """Make a banana or another bent object: an arc of ellipsoids in the xz plane, which lies on a side."""
     thick, bend = rng.uniform(0.028, 0.045) / 2, np.deg2rad(rng.uniform(40, 110))
     long = rng.uniform(0.12, 0.2)
     radius, steps = long / bend, 5
@@ -174,11 +174,11 @@ def _bent(rng: np.random.Generator) -> Thing:
         r = thick * (1 - 0.45 * (2 * angle / bend) ** 2)
         where = (radius * (np.cos(angle) - 1), 0.0, radius * np.sin(angle))
         rows.append(part((r, r, 0.75 * long / steps), (0.8, 1.0), where, about(1, -np.rad2deg(angle))))
-    return assembled("round", "bent fruit", rows, (("lying", ON_Y, 1.0),))
+    return assemble("round", "bent fruit", rows, (("lying", ON_Y, 1.0),))
 
 
 def _pen(rng: np.random.Generator) -> Thing:
-    """Pens, markers, pencils, brushes."""
+    """Make a pen, marker, pencil or brush."""
     radius, long = rng.uniform(0.007, 0.021) / 2, rng.uniform(0.09, 0.17)
     cap = radius * rng.uniform(0.85, 1.25)
     share = rng.uniform(0.25, 0.45)
@@ -186,11 +186,11 @@ def _pen(rng: np.random.Generator) -> Thing:
         part((radius, radius, (1 - share) * long / 2), (0.15, rng.uniform(0.7, 1.0)), (0, 0, (1 - share) * long / 2)),
         part((cap, cap, share * long / 2), (rng.uniform(0.1, 0.5), 1.0), (0, 0, (1 - share / 2) * long)),
     ]
-    return assembled("tool", "pen", rows, (("lying", ON_Y, 0.95), ("standing", UPRIGHT, 0.05)))
+    return assemble("tool", "pen", rows, (("lying", ON_Y, 0.95), ("standing", UPRIGHT, 0.05)))
 
 
-def _handled(rng: np.random.Generator) -> Thing:
-    """A handle with a head: hammers, screwdrivers, spatulas, brushes, spoons, torches."""
+def _add_handle(rng: np.random.Generator) -> Thing:
+    """Make a handle with a head: hammer, screwdriver, spatula, brush, spoon or torch."""
     long, thick = rng.uniform(0.1, 0.25), rng.uniform(0.012, 0.036) / 2
     flat = rng.uniform(0.5, 1.0)
     rows = [part((thick, flat * thick, long / 2), (rng.uniform(0.1, 0.4), rng.uniform(0.5, 1.0)), (0, 0, long / 2))]
@@ -204,11 +204,11 @@ def _handled(rng: np.random.Generator) -> Thing:
     else:  # a shaft
         thin, far = rng.uniform(0.002, 0.006), rng.uniform(0.04, 0.15)
         rows.append(part((thin, thin, far / 2), (0.2, 1.0), (0, 0, long + far / 2 - 0.004)))
-    return assembled("tool", "handled tool", rows, (("lying", ON_Y, 1.0),))
+    return assemble("tool", "handled tool", rows, (("lying", ON_Y, 1.0),))
 
 
 def _gun(rng: np.random.Generator) -> Thing:
-    """Drills, glue guns, hair dryers: a barrel, a grip below it and what the grip ends in."""
+    """Make a drill, glue gun or hair dryer: a barrel, a grip below it and its end."""
     barrel, thick = rng.uniform(0.12, 0.2), rng.uniform(0.035, 0.075) / 2
     grip, slope = rng.uniform(0.08, 0.14), rng.uniform(-20.0, 5.0)
     at = barrel * rng.uniform(0.15, 0.35)
@@ -219,11 +219,11 @@ def _gun(rng: np.random.Generator) -> Thing:
     ]
     if rng.random() < 0.6:
         rows.append(part((0.045, 0.03, 0.02), (0.25, 0.3), (-at, 0, 0.0)))
-    return assembled("tool", "gun", rows, (("lying", ON_Y, 0.7), ("standing", UPRIGHT, 0.3)))
+    return assemble("tool", "gun", rows, (("lying", ON_Y, 0.7), ("standing", UPRIGHT, 0.3)))
 
 
 def _toy(rng: np.random.Generator) -> Thing:
-    """Two to five parts of any form that hold together."""
+    """Make two to five connected parts of any form."""
     rows = [part(np.exp(rng.uniform(np.log(0.015), np.log(0.07), 3)), rng.uniform(0.1, 1.0, 2))]
     for _ in range(rng.integers(1, 5)):
         size = np.exp(rng.uniform(np.log(0.008), np.log(0.045), 3))
@@ -232,20 +232,20 @@ def _toy(rng: np.random.Generator) -> Thing:
         way /= np.linalg.norm(way)
         at = np.array(other[5:8]) + way * np.array(other[:3]) * rng.uniform(0.6, 1.1)
         rows.append(part(size, rng.uniform(0.1, 1.0, 2), at, quaternions.random(1, rng)[0]))
-    return assembled(
+    return assemble(
         "union", "toy", rows, (("standing", UPRIGHT, 0.5), ("lying", ON_X, 0.25), ("on its side", ON_Y, 0.25))
     )
 
 
 def _bag(rng: np.random.Generator) -> Thing:
-    """Bags and pouches: soft boxes, thinner towards the seam; sponges."""
+    """Make a bag, pouch or sponge: a soft box, thinner towards the seam."""
     width = log_uniform(rng, 0.06, 0.22)
     height, depth = width * rng.uniform(0.6, 1.6), width * rng.uniform(0.1, 0.6)
     size = np.array([depth, width, height]) / 2
     rows = [part(size, rng.uniform(0.25, 0.9, 2))]
     if rng.random() < 0.4:
         rows.append(part(size * [rng.uniform(0.1, 0.4), 0.95, 0.25], (0.3, 0.3), (0, 0, 0.9 * size[2])))
-    return assembled("soft", "bag", rows, (("lying", ON_X, 0.5), ("standing", UPRIGHT, 0.5)))
+    return assemble("soft", "bag", rows, (("lying", ON_X, 0.5), ("standing", UPRIGHT, 0.5)))
 
 
 _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thing], float], ...]]] = {
@@ -253,8 +253,8 @@ _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thin
     "can": (0.18, ((_tin, 0.55), (_jar, 0.2), (_spray_can, 0.13), (_roll, 0.12))),
     "bottle": (0.24, ((bottle, 0.92), (tube, 0.08))),
     "vessel": (0.10, ((cup, 0.45), (bowl, 0.3), (tub, 0.25))),
-    "round": (0.06, ((_fruit, 0.75), (_bent, 0.25))),
-    "tool": (0.05, ((_pen, 0.35), (_handled, 0.4), (_gun, 0.25))),
+    "round": (0.06, ((_fruit, 0.75), (_bend, 0.25))),
+    "tool": (0.05, ((_pen, 0.35), (_add_handle, 0.4), (_gun, 0.25))),
     "union": (0.04, ((_toy, 1.0),)),
     "soft": (0.04, ((_bag, 1.0),)),
 }

@@ -1,10 +1,10 @@
-"""Depth images of things: unions of superquadrics, some of them with cavities, and triangle meshes.
+"""Depth images of objects: unions of superquadrics, some of them with cavities, and triangle meshes.
 
 Unions
 ------
-A ray sees of a union the nearest part.  Where it meets the union inside of a cavity, it goes on to where it leaves that
-cavity; what the cavity's far wall consists of is the thing again.  Cavities are open towards the outside and lie within
-the union otherwise.  Table and wall are behind.
+A ray meets the nearest part of a union.  If that point is inside a cavity, the ray continues to where it leaves the
+cavity, whose far wall is the object again.  Cavities are open to the outside and otherwise lie within the union.  Table
+and wall are behind.
 
 Meshes
 ------
@@ -12,8 +12,8 @@ With the corners a, b, c of a triangle in the optical frame and the ray z d of a
 
     z = a.(b x c) / (e1 + e2 + e3),   e1 = d.(b x c),  e2 = d.(c x a),  e3 = d.(a x b),
 
-and the ray meets the triangle where e1, e2, e3 have the same sign: exact in perspective, without clipping or
-interpolation.  Pinhole cameras only; the mesh lies in front of the camera.  Metres.
+and the ray meets the triangle if e1, e2, e3 have the same sign: exact in perspective, without clipping or
+interpolation.  Pinhole cameras only; the mesh is in front of the camera.  Metres.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ def render_things(
     table: np.ndarray | None = None,
     behind: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Depth and visible thing of every pixel.
+    """Render depth and the index of the visible object of every pixel.
 
     Parameters
     ----------
     parts, cavities : Superquadric
         Batches (k,) and (m,) in the optical frame of a pinhole camera.
     owner, cavity_owner : int (k,), (m,)
-        The thing that each belongs to.
+        The object that each belongs to.
     table : (4,), optional
-        A plane n.p + d = 0, n up, that things stand on.
+        A plane n.p + d = 0, n up, that objects stand on.
     behind : float
         Depth of a wall across the whole image, metres.
 
@@ -71,7 +71,7 @@ def render_things(
 
 @kernel
 def _add_background(plane: np.ndarray, behind: float, lens: Lens, depth: np.ndarray, thing: np.ndarray) -> None:
-    """Table and wall where they are nearer than the things, in place."""
+    """Add table and wall where they are nearer than the objects, in place."""
     fx, fy, cx, cy, _ = lens
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -115,14 +115,14 @@ def _hollow_out(
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles: vertices (n, 3), and faces (m, 3) of vertex indices."""
+    """A triangle mesh: vertices (n, 3), and faces (m, 3) of vertex indices."""
 
     vertices: np.ndarray
     faces: np.ndarray
 
 
 def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
-    """Depth (height, width) of a mesh in the optical frame; +inf where there is none.
+    """Render the depth (height, width) of a mesh in the optical frame; +inf for no surface.
 
     Faces are seen from both sides.
 

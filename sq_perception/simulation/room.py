@@ -1,9 +1,9 @@
-"""The room behind a table: its edge, the floor below, and what stands on the floor.
+"""The room behind a table: the table's edge, the floor below, and what stands on the floor.
 
-What a camera sees beyond a table stands there as well, and is no thing on it.  The table ends along a line behind the
-things, across a direction a that leads away from the camera, turned by up to 70 degrees.  Behind it lies a floor, or a
-lower table, 5 to 90 cm below; on it, where it is in sight, stand up to ten superquadrics, sharp or rounded, with edges
-of 4 cm to 1 m, that may reach above the table: boxes, bins, chairs and shelves.
+Cameras also see what is beyond a table, which is no object on it.  The table ends along a line behind the objects,
+across a direction a that leads away from the camera, turned by up to 70 degrees.  Behind it is a floor, or a lower
+table, 5 to 90 cm below; on its visible part stand up to ten superquadrics, sharp or rounded, with edges of 4 cm to 1 m,
+that may reach above the table: boxes, bins, chairs and shelves.
 
 Metres, optical frame.
 """
@@ -20,7 +20,7 @@ from sq_perception.simulation.things_on_table import ThingsOnTable
 
 _TURN = float(np.deg2rad(70.0))
 _BEHIND = (0.03, 0.4)
-"""Distance of the edge, metres, behind the farthest reading of a thing."""
+"""Distance of the edge, metres, behind the farthest reading of an object."""
 _BELOW = (0.05, 0.9)
 _MOST = 10
 _HALF_SIZES = (0.02, 0.5)
@@ -29,7 +29,7 @@ _SHAPES = (0.1, 1.0)
 
 
 def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
-    """The depth (height, width) of a scene whose table ends; its things, and what hides them, stay as they are."""
+    """Return the depth (height, width) of a scene with a room behind its table; its objects and occluders stay."""
     camera, normal = scene.camera, scene.plane[:3]
     angle = rng.uniform(-_TURN, _TURN)
     away = scene.table @ np.array([np.sin(angle), np.cos(angle), 0.0])
@@ -57,7 +57,7 @@ def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
 def _standing_at(
     foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
 ) -> Superquadric:
-    """A body on the floor under a point of it, moved from the table where it would reach under its top."""
+    """Return a body on the floor below a point, moved from the table if it would reach under its top."""
     least, most = np.log(_HALF_SIZES)
     size, turn = np.exp(rng.uniform(least, most, 3)), turn_about_up(rng.uniform(0, np.pi))
     clear = foot @ away - edge - np.hypot(*size[:2])

@@ -1,4 +1,4 @@
-"""A frame to begin with: four things of known size on a table, as a RealSense D435 would measure them.
+"""A sample frame: four objects of known size on a table, as a RealSense D435 would measure them.
 
 The camera looks down on the table at 35 degrees from 0.85 m.  In the frame of the table, whose origin the camera looks
 at, x is to the right, y away from the camera and z up; full edges in metres, angles about z in degrees.
@@ -22,7 +22,7 @@ THINGS = {
     "ball": ((0.074, 0.074, 0.074), (1.0, 1.0), (0.17, -0.06), 0.0),
     "soap": ((0.095, 0.060, 0.035), (0.3, 0.3), (-0.06, -0.11), -35.0),
 }
-"""Full edges, exponents, place on the table and turn of each thing."""
+"""Full edges, exponents, place on the table and turn of each object."""
 SENSOR = "realsense_d435"
 _DISTANCE, _PITCH = 0.85, np.deg2rad(35.0)
 
@@ -39,7 +39,7 @@ class Sample:
 
 
 def sample(seed: int = 0) -> Sample:
-    """The frame; the seed is that of the sensor's noise."""
+    """Simulate the frame; the seed is that of the sensor's noise."""
     up = np.array([0.0, -np.cos(_PITCH), -np.sin(_PITCH)])
     right = np.array([1.0, 0.0, 0.0])
     table = np.stack([right, np.cross(up, right), up], axis=1)

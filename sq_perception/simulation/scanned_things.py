@@ -1,8 +1,8 @@
-"""Things of one's own, as meshes: what a network can be trained on besides the simulated household.
+"""The user's own objects as meshes, to train a network on besides the simulated household.
 
 A mesh rests on the faces of its hull on which it is stable, as often as it would settle there (K. Goldberg et al.,
-"Part pose statistics", 1999, as trimesh computes it for a body of even density).  What is seen is the mesh; what the
-network shall predict is its hull, whose corners stand in :attr:`Thing.parts` as points.
+"Part pose statistics", 1999, as computed by trimesh for uniform density).  Views show the mesh; the network predicts
+its hull, whose corners are in :attr:`Thing.parts` as points.
 
 Metres.
 """
@@ -20,7 +20,7 @@ from sq_perception.simulation.thing import NO_CAVITY, Rest, Thing
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
 LARGEST, SMALLEST = 1.0, 0.005
-"""Longest edge of the box around a thing, metres: others are taken for other units."""
+"""Longest edge of the box around an object, metres: others are taken for other units."""
 _POINT = 1e-5
 """Half size of a superquadric that stands for a point, metres."""
 _USUAL = 0.99
@@ -28,7 +28,7 @@ _USUAL = 0.99
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
-    """All meshes of a folder, by name.
+    """Read all meshes of a folder, by name.
 
     Raises
     ------

@@ -68,7 +68,7 @@ class Scene:
     plane: np.ndarray | None
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
-        """Depth float32 (height, width), NaN where nothing is seen; labels int32, k + 1 for body k, 0 elsewhere."""
+        """Render depth float32 (height, width), NaN for no surface, and labels int32, k + 1 for body k, 0 elsewhere."""
         depth, index = render(self.bodies, self.camera)
         if self.plane is not None:
             table = plane_depth(self.plane, self.camera)
@@ -78,7 +78,7 @@ class Scene:
 
 
 def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
-    """A batch (count,) of bodies of the thesis' protocol, in the cube frame."""
+    """Draw a batch (count,) of bodies of the thesis' protocol, in the cube frame."""
     return Superquadric(
         rng.uniform(*THESIS_SIZE, (count, 3)),
         rng.uniform(*THESIS_SHAPE, (count, 2)),
@@ -88,12 +88,12 @@ def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
 
 
 def thesis_scene(rng: np.random.Generator) -> Scene:
-    """One random body of the thesis' protocol before the camera of the unit cube."""
+    """Draw one random body of the thesis' protocol before the camera of the unit cube."""
     return Scene(unit_cube.optical_from_cube(thesis_bodies(1, rng)), unit_cube.camera(unit_cube.THESIS_PIXELS), None)
 
 
 def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:
-    """``count`` random bodies side by side on a table, all of them wholly inside the image.
+    """Draw ``count`` random bodies side by side on a table, all wholly inside the image.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
 
 
 def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
-    """Depth float64 (height, width) of the plane n.p + d = 0; +inf where its front is not seen within 4 m."""
+    """Return depth float64 (height, width) of the plane n.p + d = 0; +inf where its front is not within 4 m."""
     v, u = np.indices((camera.height, camera.width))
     origin, direction = camera.rays(u, v)
     slope = direction @ plane[:3]
@@ -135,14 +135,14 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
-    """The plane (4,) of a table that the camera looks down on, at a distance along its axis."""
+    """Return the plane (4,) of a table that the camera looks down on, at a distance along its axis."""
     far, down, roll = rng.uniform(*distance), rng.uniform(*pitch), rng.uniform(-_ROLL, _ROLL)
     normal = -np.array([np.cos(down) * np.sin(roll), np.cos(down) * np.cos(roll), np.sin(down)])
     return np.append(normal, far * np.sin(down))
 
 
 def turn_about_up(yaw: float) -> np.ndarray:
-    """The rotation (3, 3) by an angle, radians, about the z axis of a table's frame."""
+    """Return the rotation (3, 3) by an angle, radians, about the z axis of a table's frame."""
     c, s = np.cos(yaw), np.sin(yaw)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
 
@@ -169,7 +169,7 @@ def resting_body(
 
 
 def inside_image(body: Superquadric, camera: Camera, border: float = 0.0) -> bool:
-    """Whether the box around a body is seen whole, and no corner of it within a border of so many pixels."""
+    """Return whether the box around a body is wholly visible, this many pixels from the border."""
     lower, upper = body.bounding_box()
     if lower[2] <= 0:
         return False

@@ -1,20 +1,18 @@
-"""Segments of simulated scenes, with which of their readings are of their object: training data.
+"""Segments of simulated scenes, with the truth of which readings belong to their object: training data.
 
-Things on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
-(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or crowds
-of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by a known sensor or by
-one of random parameters (:mod:`~sq_perception.simulation.thing_sensing`); of many a smaller image is taken, whose
-borders cut things.  It is segmented as any image is, and each segment seen as a
-:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the thing that most of its pixels show; what
-shows the table, the furniture or the room at half of its pixels, and no thing at 30 % of them, has none.  A reading is
-one of the object if its pixel shows the object and it is no more than 10 mm + 1 % off: what a sensor smears over an
-edge is not.
+Objects on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
+(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or
+crowds of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by a known
+sensor or by a random one (:mod:`~sq_perception.simulation.thing_sensing`); many images are cropped, so that their
+borders cut objects.  Each image is segmented as in recovery, and each segment becomes a
+:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the one that most of its pixels show; a
+segment that shows table, furniture or room at half of its pixels, and no object at 30 % of them, has none.  A reading
+belongs to the object if its pixel shows the object and its error is at most 10 mm + 1 %, which excludes smeared
+edges.
 
-The network that learns from them is also asked whether a segment is one thing, so compact pieces of segments
-(:mod:`~sq_perception.segmentation.pieces`) are among them, and of two neighbours as if they were one, each with the
-thing that it shows; the rest of the segment is other segments.  Of a segment that shows several things there is each
-one's part.
-"""
+The network also learns whether a segment is one object.  So the views include compact pieces of segments
+(:mod:`~sq_perception.segmentation.pieces`) and of two merged neighbours, each with the object that it shows; the rest
+of the segment counts as other segments.  For a segment of several objects there is a view of each one's part. """
 
 from __future__ import annotations
 
@@ -47,24 +45,24 @@ _CROWDS, _IN_FURNITURE = 0.2, 0.3
 _WITH_ROOM = 0.6
 """Share of the other scenes whose table ends in sight, before a room."""
 _LARGER, _TIMES = 0.35, (1.0, 2.5)
-"""Share of the scenes that are as if all of it were so many times as large and as far: the largest thing that is
+"""Share of the scenes that are as if all of it were so many times as large and as far: the largest object that is
 recovered is 0.6 m long, and what is none is not told by its size."""
 _SMALLER, _SIDES = 0.6, (0.35, 0.9)
 """Share of the scenes of which a smaller image is taken, and its sides in those of the whole one."""
 _OFF, _OFF_SHARE = 0.01, 0.01
 """Metres, and share of the depth: by less than their sum a reading is off that counts as one of what it shows."""
 _MOSTLY_NOTHING, _SOME_THING = 0.5, 0.3
-"""Shares of a segment's pixels: it has no object if so many show no thing, and no more than so many show one thing."""
+"""Shares of a segment's pixels: it has no object if the first share shows none and at most the second shows one."""
 _LEAST_CELLS = 8
 """Measured cells of a segment: views with fewer are left out."""
 _SMEARED, _NO_OBJECT = -1, -2
-"""In place of a thing's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
+"""In place of an object's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
 _PIECES = (3, 7)
 """Pieces that a segment is cut into: from, and below."""
 _PURE = 0.7
-"""Share of a piece's readings that show one thing: others have no object."""
+"""Share of a piece's readings that show one object: others have no object."""
 _PART = 0.1
-"""Share of a segment from which on what shows one of several things is seen by itself as well."""
+"""Share of a segment from which on what shows one of several objects is seen by itself as well."""
 _TWO_AS_ONE, _BESIDE = 0.3, np.ones((7, 7), np.uint8)
 """Share of the segments that are seen as one with a neighbour within three pixels."""
 
@@ -86,10 +84,10 @@ class SegmentViews:
 
 
 def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
-    """Views of all segments of some random scenes, and of pieces of them."""
+    """Draw views of all segments of some random scenes, and of pieces of them."""
     images, truth = [], []
     for _ in range(scenes):
-        for image, own in _views(_measured(rng), rng):
+        for image, own in _views(_measure(rng), rng):
             if np.count_nonzero(image[..., segment_view.MEASURED] * image[..., segment_view.SEGMENT]) >= _LEAST_CELLS:
                 images.append(image.astype(np.float16))
                 truth.append(own)
@@ -102,7 +100,7 @@ def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
 
 @dataclass(frozen=True, eq=False)
 class _Measured:
-    """An image (height, width) that a sensor took of things; ``shown`` are their labels, 0 for none."""
+    """An image (height, width) that a sensor took; ``shown`` are the labels of its objects, 0 for none."""
 
     depth: np.ndarray
     true_depth: np.ndarray
@@ -114,20 +112,20 @@ class _Measured:
         return segment_view.from_segment(self.depth, labels, label, window, self.camera, plane)
 
     def in_cells(self, view: SegmentView) -> tuple[np.ndarray, np.ndarray]:
-        """What the cells (p, p) of a view show, labels or ``_SMEARED``, and whether something was measured there."""
+        """Return what the cells (p, p) of a view show, labels or ``_SMEARED``, and whether they have a reading."""
         height, width = self.depth.shape
         grid = np.ix_(np.clip(view.rows, 0, height - 1), np.clip(view.columns, 0, width - 1))
         near = np.abs(self.depth[grid] - self.true_depth[grid]) < _OFF + _OFF_SHARE * self.depth[grid]
         return np.where(near, self.shown[grid], _SMEARED), view.image[..., segment_view.MEASURED] > 0
 
 
-def _measured(rng: np.random.Generator) -> _Measured:
-    """A random image."""
+def _measure(rng: np.random.Generator) -> _Measured:
+    """Draw a random image."""
     true_depth, shown, camera = _scene(rng)
     if rng.random() < _LARGER:
         true_depth = rng.uniform(*_TIMES) * true_depth
     if rng.random() < _ANY_SENSOR:
-        depth = thing_sensing.measured_by_any(true_depth, shown > 0, camera, Stages(), rng)
+        depth = thing_sensing.measure_by_any(true_depth, shown > 0, camera, Stages(), rng)
     else:
         depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(true_depth, camera, rng)
     window = _cut(shown, rng)
@@ -137,10 +135,10 @@ def _measured(rng: np.random.Generator) -> _Measured:
 
 
 def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """True depth (height, width), +inf where nothing is, and labels of a random scene."""
+    """Draw the true depth (height, width), +inf for no surface, and labels of a random scene."""
     camera, kind = _camera(rng), rng.random()
     if kind < _CROWDS:
-        depth, shown = crowds.crowded_scene(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
+        depth, shown = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
         return np.where(np.isnan(depth), np.inf, depth), shown, camera
     if kind < _CROWDS + _IN_FURNITURE:
         drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)
@@ -151,7 +149,7 @@ def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
 
 
 def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Images and truth of segments, and of pieces of them."""
+    """Return images and truth of segments, and of pieces of them."""
     found = segments.segment(measured.depth, measured.camera)
     for label in found.ids:
         view = measured.view(found.labels, label, found.plane)
@@ -164,7 +162,7 @@ def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.n
 def _of_merged(
     label: int, found: segments.Segmentation, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Images and truth of each thing that a segment shows, if several, and of pieces of it and a neighbour as one."""
+    """Return images and truth of each object in a merged segment, and of pieces of it joined to a neighbour."""
     mask = found.labels == label
     counts = np.bincount(measured.shown[mask], minlength=1)
     things = np.flatnonzero(counts[1:] > _PART * counts.sum()) + 1
@@ -183,7 +181,7 @@ def _of_merged(
 def _of_pieces(
     view: SegmentView, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Images and truth of pieces of a segment that show one thing: of one of them, or if they show several, of all."""
+    """Return images and truth of pieces of a segment that show one object: one piece, or all if they show several."""
     cells, known = measured.in_cells(view)
     segment = view.image[..., segment_view.SEGMENT] > 0
     some, of = [], []
@@ -207,7 +205,7 @@ def _camera(rng: np.random.Generator) -> Camera:
 
 
 def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
-    """A window of the image; some are small, about a thing or beside it, so that their borders cut things."""
+    """Return a window of the image; some are small, at or beside an object, so that their borders cut objects."""
     height, width = shown.shape
     if rng.random() >= _SMALLER:
         return slice(0, height), slice(0, width)
@@ -220,7 +218,7 @@ def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
 
 
 def _object(shown: np.ndarray) -> int:
-    """The thing that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
+    """Return the object that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
     counts = np.bincount(shown, minlength=2)
     most, total = int(counts[1:].argmax()) + 1, counts.sum()
     has_none = counts[0] >= _MOSTLY_NOTHING * total and counts[most] <= _SOME_THING * total
@@ -228,5 +226,5 @@ def _object(shown: np.ndarray) -> int:
 
 
 def _truth(cells: np.ndarray, known: np.ndarray, thing: int) -> np.ndarray:
-    """NO, YES or UNKNOWN (p, p)."""
+    """Return NO, YES or UNKNOWN (p, p)."""
     return np.where(known, np.where(cells == thing, YES, NO), UNKNOWN).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""What every model of a depth sensor offers; see :mod:`sq_perception.simulation.sensor_noise` for the sensors."""
+"""The interface of depth sensor models; :mod:`sq_perception.simulation.sensor_noise` has the sensors."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from sq_perception.imaging.camera import Camera
 
 @dataclass(frozen=True)
 class SensorNoise(ABC):
-    """A sensor; see the module."""
+    """A depth sensor; see the module."""
 
     def measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-        """What the sensor reports, float32 (height, width) metres, NaN where nothing is measured.
+        """Measure a true depth image: float32 (height, width) metres, NaN for no reading.
 
         Parameters
         ----------
@@ -39,10 +39,10 @@ class SensorNoise(ABC):
         if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
             raise ValueError(f"depth: expected a floating image (height, width), got {depth.dtype} {depth.shape}")
         camera.check_image(depth)
-        return self._measured(depth, camera, rng)
+        return self._measure(depth, camera, rng)
 
     def sigma(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
-        """Standard deviation, metres, of a reading at depth z metres where the incidence has this cosine; broadcasts.
+        """Return the standard deviation, metres, of a reading at depth z with this cosine of incidence; broadcasts.
 
         Raises
         ------
@@ -57,11 +57,11 @@ class SensorNoise(ABC):
         return self._sigma(z, cosine) + np.zeros(np.broadcast_shapes(z.shape, cosine.shape))
 
     def dropout(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
-        """Share of the readings of a surface that are missing; arguments as of :meth:`sigma`."""
+        """Return the share of missing readings of a surface; arguments as of :meth:`sigma`."""
         return np.zeros(np.broadcast_shapes(np.shape(z), np.shape(cosine)))
 
     @abstractmethod
-    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray: ...
+    def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray: ...
 
     @abstractmethod
     def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray: ...
@@ -69,14 +69,14 @@ class SensorNoise(ABC):
 
 @dataclass(frozen=True)
 class Ideal(SensorNoise):
-    """Independent Gaussian noise of ``deviation`` metres everywhere, nothing else; for any camera and any depth."""
+    """Sensor with independent Gaussian noise of ``deviation`` metres, for any camera and depth."""
 
     deviation: float = 0.0
 
     def __post_init__(self) -> None:
         check(self, deviation=(0.0, np.inf))
 
-    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
         seen = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
         if self.deviation == 0:
             return seen
@@ -87,7 +87,7 @@ class Ideal(SensorNoise):
 
 
 def check(model: SensorNoise, **limits: tuple[float, float]) -> None:
-    """Raise ValueError unless each attribute that is named here is a finite number within its limits."""
+    """Raise ValueError unless each named attribute is a finite number within its limits."""
     for name, (low, high) in limits.items():
         value = getattr(model, name)
         if not (np.isfinite(value) and low <= value <= high):
@@ -95,6 +95,6 @@ def check(model: SensorNoise, **limits: tuple[float, float]) -> None:
 
 
 def steepness(cosine: np.ndarray) -> np.ndarray:
-    """theta / (pi/2 - theta) of the angle of incidence theta with this cosine."""
+    """Return theta / (pi/2 - theta) of the angle of incidence theta with this cosine."""
     theta = np.arccos(np.minimum(cosine, 1))
     return theta / (np.pi / 2 - theta)

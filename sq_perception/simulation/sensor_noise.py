@@ -1,4 +1,4 @@
-"""What real depth sensors make of a true depth image: noise, steps, edges and holes.
+"""Models of real depth sensors: noise, steps, edges and holes of a true depth image.
 
     model = sensor_noise.preset("kinect_v1")
     model.measured(depth, camera, rng)                # what it reports of a true depth image, NaN where nothing
@@ -91,7 +91,7 @@ PRESETS: Mapping[str, SensorNoise] = MappingProxyType(
 
 
 def preset(name: str) -> SensorNoise:
-    """The sensor of this name.
+    """Return the sensor of this name.
 
     Raises
     ------

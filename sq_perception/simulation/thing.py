@@ -1,12 +1,12 @@
-"""A household thing: a union of superquadrics with its ways to rest, and what families of things are built of.
+"""A household object: a union of superquadrics with its resting poses, and building blocks of object families.
 
-A thing is a union of superquadrics in its own frame: metres, z up when it stands, the middle of its box at the origin.
-What a planner needs of it, its convex hull, has the support function
+An object is a union of superquadrics in its own frame: metres, z up when it stands, box centre at the origin.
+Its convex hull, which planners need, has the support function
 
     h(n) = max over the parts of  n.t + h_part(R^T n),
 
-closed form through :meth:`Superquadric.support`.  An open vessel has cavities besides, superquadrics that are cut away
-from the union; its hull does not know them.
+in closed form by :meth:`Superquadric.support`.  An open vessel also has cavities, superquadrics that are removed from
+the union; the hull ignores them.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
-"""The thing's x axis points up: it lies on a side."""
+"""The object's x axis points up: it lies on a side."""
 ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
-"""The thing's y axis, of an oval bottle the shorter one, points up."""
+"""The object's y axis, of an oval bottle the shorter one, points up."""
 INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
 
 SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
@@ -46,7 +46,7 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """A way to rest: the rotation, a quaternion (4,), from the thing's frame to one with z up, and its probability."""
+    """A resting pose: the quaternion (4,) from the object's frame to one with z up, and its probability."""
 
     name: str
     turn: np.ndarray
@@ -55,7 +55,7 @@ class Rest:
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """One household thing.
+    """A household object.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Thing:
     name : str
         The family within the kind.
     parts : Superquadric
-        Batch (k,) in the thing's own frame, metres.
+        Batch (k,) in the object's own frame, metres.
     rests : tuple of Rest
         How it may lie; their probabilities add up to 1.
     cavities : Superquadric
@@ -81,19 +81,19 @@ class Thing:
     surface: Mesh | None = None
 
     def support(self, directions: np.ndarray) -> np.ndarray:
-        """max n.p over the convex hull, in the thing's frame, for unit directions (J, 3), shape (J,)."""
+        """Return max n.p over the convex hull, in the object's frame, for unit directions (J, 3), shape (J,)."""
         return support_of_union(self.parts, directions)
 
     @cached_property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner (3,) of the box around the thing in its own frame."""
+        """Lower and upper corner (3,) of the box around the object in its own frame."""
         reach = self.support(SIX_WAYS)
         return -reach[3:], reach[:3]
 
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
-        """A way to rest, turned about the vertical by any angle: its name and the quaternion (4,) to a frame with z up.
+        """Draw a resting pose, turned about the vertical: its name and the quaternion (4,) to a frame with z up.
 
-        ``leaning`` is the share of things that are tilted by 4 to 35 degrees, as by something under or beside them.
+        ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them.
         """
         rest = self.rests[one_of([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
@@ -104,13 +104,13 @@ class Thing:
 
 
 def _turn(x: float, y: float, z: float, angle: float) -> np.ndarray:
-    """The quaternion of a turn about a unit axis by an angle in radians."""
+    """Return the quaternion of a turn about a unit axis by an angle in radians."""
     s = np.sin(angle / 2)
     return np.array([x * s, y * s, z * s, np.cos(angle / 2)])
 
 
 def one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
-    """A random index with these weights."""
+    """Draw a random index with these weights."""
     return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
 
 
@@ -120,22 +120,22 @@ def part(
     at: Numbers = (0.0, 0.0, 0.0),
     turn: Numbers = _STRAIGHT,
 ) -> Row:
-    """A superquadric: half sizes, exponents, centre, quaternion."""
+    """Return a superquadric of half sizes, exponents, centre, quaternion."""
     return (*size, *shape, *at, *turn)
 
 
 def about(axis: int, degrees: float) -> Row:
-    """The quaternion of a turn about a coordinate axis."""
+    """Return the quaternion of a turn about a coordinate axis."""
     half = np.deg2rad(degrees) / 2
     turn = [0.0, 0.0, 0.0, float(np.cos(half))]
     turn[axis] = float(np.sin(half))
     return tuple(turn)
 
 
-def assembled(
+def assemble(
     kind: str, name: str, rows: list[Row], rests: Sequence[tuple[str, np.ndarray, float]], cut: Sequence[Row] = ()
 ) -> Thing:
-    """The thing of some parts, less what is cut away, moved to the middle of its box; rests by name, turn, weight."""
+    """Make an object of parts and cavities, moved to the middle of its box; rests by name, turn, weight."""
     flat = np.array(rows)
     reach = flat_support(flat, SIX_WAYS)
     middle = 0.5 * (reach[:3] - reach[3:])
@@ -149,5 +149,5 @@ def assembled(
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """A random number whose logarithm is uniform."""
+    """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))

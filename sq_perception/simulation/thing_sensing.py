@@ -1,9 +1,9 @@
-"""What random depth sensors report of a simulated thing: errors, and readings that are missing.
+"""Measurements of a simulated object by random depth sensors: errors and missing readings.
 
 One of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline on either side,
 fattened or mixed or wandering edges, lost grazing sides.  Besides, in some images: waves, a side that is lost as one
-eye hardly sees it, lost edges, contours, dark blobs and bands, things that are lost but for patches, smoothing.  In
-half of them what is missing beside the thing is filled with what is there.  Last come the camera's
+eye hardly sees it, lost edges, contours, dark blobs and bands, objects that are lost but for patches, smoothing.  In
+half of them what is missing beside the object is filled with what is there.  Last come the camera's
 :mod:`~sq_perception.simulation.camera_stages`.
 
 Depth in metres.
@@ -21,12 +21,12 @@ from sq_perception.simulation.camera_stages import Stages, temporal
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 
 _SHINING = 0.08
-"""Share of the images whose things are lost but for patches.  Of household things that are half visible, 4 % are
+"""Share of the images whose objects are lost but for patches.  Of household objects that are half visible, 4 % are
 measured at less than half of their pixels."""
 
 
 def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
-    """A depth sensor with random parameters around those of :data:`sensor_noise.PRESETS`."""
+    """Draw a depth sensor with random parameters around those of :data:`sensor_noise.PRESETS`."""
     choice = rng.random()
     if choice < 0.1:
         return Ideal(rng.uniform(0, 0.001))
@@ -50,17 +50,17 @@ def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
     return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 4)))
 
 
-def measured_by_any(
+def measure_by_any(
     depth: np.ndarray, seen: np.ndarray, camera: Camera, stages: Stages, rng: np.random.Generator
 ) -> np.ndarray:
-    """What a camera of a random sensor and these stages reports of a true depth image."""
+    """Measure a true depth image with a random sensor and these camera stages."""
     sensor = draw_sensor(camera, rng)
     frames = [sensor.measured(depth, camera, rng) for _ in range(stages.frames)]
     measured = temporal(frames, stages.factor, stages.threshold) if len(frames) > 1 else frames[0]
     if rng.random() < 0.4:
         measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:
-        measured[seen & _turned_aside(depth, camera, rng)] = np.nan
+        measured[seen & _turn_aside(depth, camera, rng)] = np.nan
     if rng.random() < 0.25:
         measured[_edges(depth, rng)] = np.nan
     if rng.random() < 0.1:
@@ -70,7 +70,7 @@ def measured_by_any(
     if rng.random() < _SHINING:
         measured[seen & _between_patches(seen, rng)] = np.nan
     if rng.random() < 0.3:
-        measured = _smoothed(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
+        measured = _smooth(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
     if rng.random() < 0.5:
         filled = ~seen & np.isnan(measured) & np.isfinite(depth)
         measured[filled] = depth[filled]
@@ -78,14 +78,14 @@ def measured_by_any(
 
 
 def _waves(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Smooth errors, metres at 1 m: what calibration and the interpolation of disparities leave."""
+    """Draw smooth errors, metres at 1 m, as calibration and disparity interpolation leave them."""
     coarse = rng.standard_normal((int(rng.integers(4, 14)), int(rng.integers(4, 14))), dtype=np.float32)
     sigma = np.float32(0.0005 * 8.0 ** rng.random())
     return sigma * cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
 
 
 def _edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Most pixels within one to three pixels of a step in depth."""
+    """Select most pixels within one to three pixels of a depth step."""
     inverse = (1 / depth).astype(np.float32)
     brush = np.ones((3, 3), np.uint8)
     highest = cv2.dilate(inverse, brush)
@@ -97,22 +97,22 @@ def _edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _contours(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Thin lines of equal disparity, at which some sensors that measure in steps find no match."""
+    """Select thin lines of equal disparity, where some sensors that measure in steps find no match."""
     inverse = 1 / depth
     near, far = inverse[seen].max(), inverse[seen].min()
     lines = rng.uniform(1.5, 6.0) / max(near - far, 1e-6)
     return (inverse * lines + rng.random()) % 1.0 < rng.uniform(0.03, 0.12)
 
 
-def _turned_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-    """Surfaces that turn away to one side of the image by more than a random angle."""
+def _turn_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    """Select surfaces that turn away to one side of the image by more than a random angle."""
     with np.errstate(invalid="ignore"):
         slope = cv2.Sobel(depth, cv2.CV_64F, 1, 0, ksize=1) * (0.5 * camera.fx) / depth
         return rng.choice([-1.0, 1.0]) * slope > np.tan(np.deg2rad(rng.uniform(45, 82)))
 
 
 def _blob(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A dark label: an ellipse or a band somewhere on the thing."""
+    """Select a dark label: an ellipse or a band somewhere on the object."""
     v, u = np.nonzero(seen)
     at = rng.integers(v.size)
     side = max(np.ptp(u), np.ptp(v)) + 1
@@ -126,14 +126,14 @@ def _blob(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def _between_patches(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Most of a thing that shines, is dark or lets light through."""
+    """Select most of an object that is shiny, dark or translucent."""
     coarse = rng.standard_normal((int(rng.integers(3, 12)), int(rng.integers(3, 12))), dtype=np.float32)
     field = cv2.resize(coarse, (seen.shape[1], seen.shape[0]), interpolation=cv2.INTER_CUBIC)
     return field > np.quantile(field[seen], 1 - rng.uniform(0.3, 0.95))
 
 
-def _smoothed(measured: np.ndarray, width: int, within: np.ndarray | None) -> np.ndarray:
-    """The mean of the readings of a window, of all of them or of those within a mask alone."""
+def _smooth(measured: np.ndarray, width: int, within: np.ndarray | None) -> np.ndarray:
+    """Average the readings of a window, all of them or only those within a mask."""
     known = np.isfinite(measured)
     inner = known if within is None else known & within
     weight = cv2.blur(inner.astype(np.float32), (width, width))

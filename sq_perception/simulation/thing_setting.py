@@ -1,9 +1,9 @@
-"""A thing before a camera, in a random pose with what is around it; metres, optical frame unless noted.
+"""An object before a camera, in a random pose with surroundings; metres, optical frame unless noted.
 
 pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
-camera      sees the thing from 20 to 70 degrees above the table, in a quarter from 65 to 90 (many robots' cameras look
+camera      sees the object from 20 to 70 degrees above the table, in a quarter from 65 to 90 (many robots' cameras look
             straight down), in a fifth from 3 to 25; a roll of some degrees; off the image's middle by up to 27 degrees;
-            0.35 to 2 m away; the thing is 15 to 80 pixels wide
+            0.35 to 2 m away; the object is 15 to 80 pixels wide
 around it   up to three neighbours on the table, the table's end, a wall or nothing behind it
 """
 
@@ -15,21 +15,21 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.union import flat_support, moved
+from sq_perception.geometry.union import flat_support, move
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
 ON_TOP, FREE = 0.15, 0.05
-"""Shares of the views in which the thing stands on something on the table, and in which there is no table."""
+"""Shares of the views in which the object stands on something on the table, and in which there is no table."""
 _ELEVATIONS, _OFTEN = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0)), (0.55, 0.25, 0.2)
 """Degrees, and shares of the views.  Chosen: of a network that saw 0.5 % from above 80 degrees the hulls there erred
 half as much again as those at 20 to 70."""
 _DISTANCE = (0.35, 1.3, 2.0)
 _FARTHEST = 12.0
-"""Diagonals of its box, more than which no thing is away."""
+"""Diagonals of its box, more than which no object is away."""
 _NEAREST = 0.05
-"""Metres before the camera that no thing comes nearer than: long ones are farther away."""
+"""Metres before the camera that no object comes nearer than: long ones are farther away."""
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
 _PIXELS_ACROSS = (15.0, 80.0)
@@ -37,17 +37,17 @@ _OFF_AXIS = (0.5, 0.4)
 _BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 _LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
 _AROUND = 0.7
-"""Half of the image's side over the thing's width."""
+"""Half of the image's side over the object's width."""
 
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """A thing before a camera, in the optical frame.
+    """An object before a camera, in the optical frame.
 
     Attributes
     ----------
     parts, cavities : Superquadric
-        The thing's own, batches (k,) and (m,).
+        The object's own, batches (k,) and (m,).
     others : Superquadric
         Batch (j,), j >= 0: neighbours, and what it stands on.
     table : (4,) or None
@@ -56,9 +56,9 @@ class Setting:
         Depth of the wall behind all, +inf without one.
     camera : Camera
     surface : Mesh, optional
-        The thing's surface, if it is seen as a mesh.
+        The object's surface, if it is seen as a mesh.
     height
-        Height above the table of what the thing stands on, metres.
+        Height above the table of what the object stands on, metres.
     """
 
     parts: Superquadric
@@ -72,22 +72,22 @@ class Setting:
 
     @property
     def under(self) -> np.ndarray | None:
-        """What the thing stands on, as ``table``: that, or along it the top of something."""
+        """The surface that the object stands on, as ``table``: that, or along it the top of something."""
         return None if self.table is None else self.table - np.array([0.0, 0.0, 0.0, self.height])
 
-    def seen_from(self, place: np.ndarray, camera: Camera) -> Setting:
-        """The same before a camera at ``place`` (3,), which looks the same way."""
+    def view_from(self, place: np.ndarray, camera: Camera) -> Setting:
+        """Return the same setting for a camera at ``place`` (3,) with the same orientation."""
 
-        def shifted(bodies: Superquadric) -> Superquadric:
+        def shift(bodies: Superquadric) -> Superquadric:
             return replace(bodies, translation=bodies.translation - place)
 
         table = None if self.table is None else self.table + np.array([0.0, 0.0, 0.0, self.table[:3] @ place])
         surface = None if self.surface is None else Mesh(self.surface.vertices - place, self.surface.faces)
-        parts, cavities, others = shifted(self.parts), shifted(self.cavities), shifted(self.others)
+        parts, cavities, others = shift(self.parts), shift(self.cavities), shift(self.others)
         return Setting(parts, cavities, others, table, self.behind - place[2], camera, surface, self.height)
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (height, width), +inf where there is nothing, and where the thing is seen."""
+        """Render depth (height, width), +inf for no surface, and the object's visible pixels."""
         if self.surface is not None:
             around = np.ones(len(self.others))
             depth, _ = render_things(self.others, around, NO_CAVITY, np.zeros(0), self.camera, self.table, self.behind)
@@ -101,10 +101,10 @@ class Setting:
 
 
 def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
-    """The thing in a random pose before a random camera; see the module."""
+    """Draw a random pose of the object before a random camera; see the module."""
     free = rng.random() < FREE
     turn = quaternions.random(1, rng)[0] if free else thing.pose(rng)[1]
-    parts = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    parts = move(thing.parts.to_flat(), turn, np.zeros(3))
     reach = flat_support(parts, SIX_WAYS)
     others, floor = [], 0.0
     if not free:
@@ -117,7 +117,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     lift = np.array([0.0, 0.0, reach[5]])
     look, shift, distance = _camera_pose(parts, reach, lift, rng)
     matrix = quaternions.to_matrix(look)
-    parts = moved(parts, look, shift + matrix @ lift)
+    parts = move(parts, look, shift + matrix @ lift)
     surface = None
     if thing.surface is not None:
         placed = thing.surface.vertices @ (matrix @ quaternions.to_matrix(turn)).T + shift + matrix @ lift
@@ -125,11 +125,11 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     cavities = thing.cavities
     if len(cavities):
         cavities = Superquadric.from_flat(
-            moved(cavities.to_flat(), quaternions.multiply(look, turn), shift + matrix @ lift)
+            move(cavities.to_flat(), quaternions.multiply(look, turn), shift + matrix @ lift)
         )
     table = None if free else np.append(matrix[:, 2], -(matrix[:, 2] @ shift) - floor)
     behind = distance * rng.uniform(1.3, 3.0) if rng.random() < 0.85 else np.inf
-    around = moved(np.array(others).reshape(-1, 12), look, shift)
+    around = move(np.array(others).reshape(-1, 12), look, shift)
     camera = _camera(parts, rng)
     thing_parts, others_around = Superquadric.from_flat(parts), Superquadric.from_flat(around)
     return Setting(thing_parts, cavities, others_around, table, behind, camera, surface, -floor)
@@ -138,9 +138,9 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
 def _camera_pose(
     parts: np.ndarray, reach: np.ndarray, lift: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Optical from table frame of a random camera, a quaternion (4,) and a translation (3,), and how far the thing is.
+    """Draw the optical from table pose, a quaternion (4,) and a translation (3,), and the object's distance.
 
-    The thing's parts (k, 12) are in its own frame, ``reach`` (6,) is its support in SIX_WAYS there, and ``lift`` (3,)
+    The object's parts (k, 12) are in its own frame, ``reach`` (6,) is its support in SIX_WAYS there, and ``lift`` (3,)
     leads to the table's frame.
     """
     elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))
@@ -160,14 +160,14 @@ def _camera_pose(
 
 
 def looking_down(pitch: float, roll: float) -> np.ndarray:
-    """Optical from table frame, a quaternion: the axis ``pitch`` radians below the horizon, towards the table's y."""
+    """Return the optical from table quaternion: the axis ``pitch`` below the horizon, towards the table's y."""
     half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
     c, s = np.cos(half), np.sin(half)
     return np.array([s * np.cos(other), s * np.sin(other), c * np.sin(other), c * np.cos(other)])
 
 
 def _pitch(ray: np.ndarray, elevation: float, roll: float) -> float:
-    """The pitch, radians, of a camera whose ray comes down on the table at ``elevation``, or as steeply as it can.
+    """Return the pitch, radians, of a camera whose ray meets the table at ``elevation``, or as steeply as it can.
 
     With r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation).
     """
@@ -177,7 +177,7 @@ def _pitch(ray: np.ndarray, elevation: float, roll: float) -> float:
 
 
 def _camera(parts: np.ndarray, rng: np.random.Generator) -> Camera:
-    """A camera whose image is the thing and what is around it."""
+    """Draw a camera whose image shows the object and its surroundings."""
     right, down, _, left, up, _ = flat_support(parts, SIX_WAYS)
     z = float(parts[:, 7].mean())
     width = max(right + left, down + up)
@@ -190,7 +190,7 @@ def _camera(parts: np.ndarray, rng: np.random.Generator) -> Camera:
 
 
 def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndarray:
-    """A flat part (12,) under the thing, from the table up to height 0."""
+    """Return a flat part (12,) under the object, from the table up to height 0."""
     half = np.array([0.5 * (reach[0] + reach[3]), 0.5 * (reach[1] + reach[4])]) * rng.uniform(0.6, 1.8, 2)
     middle = 0.5 * (reach[:2] - reach[3:5])
     e2 = 1.0 if rng.random() < 0.2 else 0.08
@@ -200,7 +200,7 @@ def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndar
 def _with_neighbours(
     others: list[np.ndarray], parts: np.ndarray, floor: float, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Parts (12,), and up to three more beside the thing, as seen from above, of which none goes through another one.
+    """Add up to three parts (12,) beside the object, as seen from above, without penetration.
 
     Many are between it and the camera, many touch it.
     """
@@ -222,5 +222,5 @@ def _with_neighbours(
 
 
 def _apart(row: np.ndarray, other: np.ndarray) -> bool:
-    """Whether one of some planes that stand on the table lies between both."""
+    """Return whether one of some vertical planes separates both."""
     return bool((flat_support(row, _LEVEL) + flat_support(other, -_LEVEL) <= 0).any())

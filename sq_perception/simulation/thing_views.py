@@ -1,15 +1,15 @@
-"""Canonical views of household things as cameras see them, with the support function of their hulls: training data.
+"""Canonical views of household objects as cameras see them, with the support function of their hulls: training data.
 
-Each view is what :func:`canonical_view.from_mask` makes of a small pinhole image of the thing on its table, after a
+Each view is what :func:`canonical_view.from_mask` makes of a small pinhole image of the object on its table, after a
 sensor measured it: what a network is trained on is made by the code that it will be used with.  The image is drawn as
 follows.
 
-    setting     pose, camera and what is around the thing: :mod:`sq_perception.simulation.thing_setting`
+    setting     pose, camera and what is around the object: :mod:`sq_perception.simulation.thing_setting`
     before it   in some images something nearer, which comes in from one side
     sensor      with what it loses: :mod:`sq_perception.simulation.thing_sensing`
     mask        too small or too large by up to two pixels, with or without what measured the table, and what nothing
                 measured; of some a part is lost
-    image       a border that cuts the thing
+    image       a border that cuts the object
 
 Metres; optical frame of the camera unless noted.
 """
@@ -33,32 +33,32 @@ from sq_perception.imaging.coherence import coherent, shown_step
 from sq_perception.simulation.camera_stages import Stages, aligned, decimated, decimated_camera, draw_stages
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.thing import Thing
-from sq_perception.simulation.thing_sensing import measured_by_any
+from sq_perception.simulation.thing_sensing import measure_by_any
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 
 OWN = 0.5
-"""Share of the views that show one's own things, where there are such."""
+"""Share of the views that show one's own objects, where there are such."""
 PLANE_GIVEN, TOP_GIVEN = 0.8, 2 / 3
-"""Shares of the views with a plane, and of those of a thing on top of something in which it is that top, as often as
-:mod:`sq_perception.recovery.supports` finds it.  Else the thing hovers above its plane, and a network that often sees
-that expects it of things whose lower end is hidden."""
+"""Shares of the views with a plane, and of those of an object on top of something in which it is that top, as often as
+:mod:`sq_perception.recovery.supports` finds it.  Else the object hovers above its plane, and a network that often sees
+that expects it of objects whose lower end is hidden."""
 BEFORE, MOST_BEFORE = 0.25, 0.6
-"""Share of the views with something nearer before the thing, and the most of the thing that it hides.  Chosen: of the
-things of household scenes a quarter are hidden by a tenth and more."""
+"""Share of the views with something nearer before the object, and the most of the object that it hides.  Chosen: of the
+objects of household scenes a quarter are hidden by a tenth and more."""
 UNREAD = 0.5
 """Share of the views whose mask covers pixels without a reading: masks from colour do, those from depth do not."""
 LOST, MOST_LOST = 0.08, 0.3
-"""Share of the views whose mask has lost what lies beyond a straight line, and the most of the thing that it loses.
-Of things of household scenes that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation."""
+"""Share of the views whose mask has lost what lies beyond a straight line, and the most of the object that it loses.
+Of objects of household scenes that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation."""
 PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
-"""Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
+"""Standard deviations of the given plane: of its tilt in both directions, and of its distance from the object."""
 
 _MASK_ERRORS = (-2, -1, 0, 0, 0, 0, 0, 1, 1, 2)
 """Pixels by which masks are too large, each as often.  Few are too small, as those that are all around are completed
 before a view is made (:func:`sq_perception.recovery.seen_object.completed`), and what a stereo camera widens an edge by
 looks like them."""
 _PIXELS = 64
-"""Side of the views: what the network of things takes."""
+"""Side of the views: what the network of objects takes."""
 _LEAST_SEEN = 40
 _LARGEST_SUPPORT, _LEAST_WIDTH = 3.0, 0.6
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
@@ -68,18 +68,18 @@ _ON_TABLE = 0.003
 
 @dataclass(frozen=True, eq=False)
 class ThingViews:
-    """Views of n things, p x p pixels.
+    """Views of n objects, p x p pixels.
 
     Attributes
     ----------
     images : float32 (n, p, p)
-        As :attr:`CanonicalView.with_steps`: z in (0, 1] on the thing.
+        As :attr:`CanonicalView.with_steps`: z in (0, 1] on the object.
     planes : float32 (n, 4)
         The plane n.p + d = 0 of the table in the view's frame and unit, n up; zeros where none is given.
     extents : float32 (n,)
         Sides of the views, metres.
     support : float32 (n, 42)
-        max n.(p - c) over the thing's hull for n of :data:`DIRECTIONS`, c = (1/2, 1/2, NEAREST), in sides of the view.
+        max n.(p - c) over the object's hull for n of :data:`DIRECTIONS`, c = (1/2, 1/2, NEAREST), in sides of the view.
     kinds : int64 (n,)
         Index into :data:`household.KINDS`.
     """
@@ -92,7 +92,7 @@ class ThingViews:
 
 
 def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] = ()) -> ThingViews:
-    """Views of ``count`` random things, half of them one's ``own`` where there are such."""
+    """Draw views of ``count`` random objects, half of them of ``own`` objects if there are any."""
     images = np.empty((count, _PIXELS, _PIXELS), dtype=np.float32)
     planes, extents = np.zeros((count, 4), np.float32), np.empty(count, np.float32)
     support, numbers = np.empty((count, len(DIRECTIONS)), np.float32), np.empty(count, dtype=np.int64)
@@ -104,25 +104,25 @@ def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] 
 
 
 def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
-    """The support function (42,) of a union, given in the optical frame, as :class:`ThingViews` has it."""
+    """Return the support function (42,) of a union in the optical frame, as in :class:`ThingViews`."""
     directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
     return (support_of_union(parts, directions) - directions @ view.anchor) / view.extent
 
 
 def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
-    """A thing, its view, the plane in the view's frame and its support function."""
+    """Draw an object, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng)
         setting = draw_setting(thing, rng)
         stages = draw_stages(rng)
-        measured, seen, camera = _measured(setting, stages, rng)
+        measured, seen, camera = _measure(setting, stages, rng)
         plane = None
         below = setting.under if rng.random() < TOP_GIVEN else setting.table
         if below is not None and rng.random() < PLANE_GIVEN:
             plane = _imprecise(below, setting.parts.translation.mean(axis=0), rng)
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
-        mask = _masked(measured, seen, camera, setting.table if plane is None else plane, rng)
+        mask = _mask(measured, seen, camera, setting.table if plane is None else plane, rng)
         if rng.random() < LOST:
             mask = _partly(mask, rng)
         if rng.random() >= UNREAD:
@@ -138,8 +138,8 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
 
 
-def _measured(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """The image that a camera of these stages makes, where the thing is seen, and the camera."""
+def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """Draw the image of a camera with these stages, the object's visible pixels, and the camera."""
     camera = setting.camera
     depth, seen = setting.render()
     if stages.beside:
@@ -149,22 +149,22 @@ def _measured(setting: Setting, stages: Stages, rng: np.random.Generator) -> tup
         middle = setting.parts.translation[:, 2].mean()
         cx = stages.focal * (camera.cx + camera.fx * stages.beside / middle)
         sensor = Camera(*size, stages.focal * camera.fx, stages.focal * camera.fy, cx, stages.focal * camera.cy)
-        near, whose = setting.seen_from(place, sensor).render()
-        measured = measured_by_any(near, whose, sensor, stages, rng) if whose.any() else near
+        near, whose = setting.view_from(place, sensor).render()
+        measured = measure_by_any(near, whose, sensor, stages, rng) if whose.any() else near
         return aligned(measured, sensor, place, camera, stages.whole), seen, camera
     depth, seen = _something_before(depth, seen, rng)
     if stages.decimation > 1:
         half = slice(stages.decimation // 2, None, stages.decimation)
         kept = decimated_camera(camera, stages.decimation)
         shown = np.s_[: kept.height, : kept.width]
-        measured = measured_by_any(depth, seen, camera, stages, rng) if seen.any() else depth
+        measured = measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth
         return decimated(measured, stages.decimation), seen[half, half][shown], kept
-    return measured_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
+    return measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
 
 
 def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """The image and the thing's mask; in some something nearer comes in from one side: a straight edge, a corner or a
-    round thing."""
+    """The image and the object's mask; in some something nearer comes in from one side: a straight edge, a corner or a
+    round object."""
     if rng.random() > BEFORE or not seen.any():
         return depth, seen
     v, u = np.nonzero(seen)
@@ -183,17 +183,17 @@ def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Genera
 
 
 def _imprecise(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The plane as it is found: tilted about the point below ``at`` and shifted."""
+    """Return the plane as it would be found: tilted about the point below ``at`` and shifted."""
     normal = plane[:3] + PLANE_TILT * rng.standard_normal(3)
     normal /= np.linalg.norm(normal)
     foot = at - (plane[:3] @ at + plane[3]) * plane[:3]
     return np.append(normal, -(normal @ foot) + rng.normal(0, PLANE_SHIFT))
 
 
-def _masked(
+def _mask(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
-    """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""
+    """Draw a mask as from a segmentation or a person, without readings of the table, as in views of images."""
     error = int(rng.choice(_MASK_ERRORS))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:
@@ -214,7 +214,7 @@ def _masked(
 
 
 def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The mask without what lies beyond a straight line."""
+    """Remove from the mask what lies beyond a straight line."""
     v, u = np.nonzero(mask)
     if not v.size:
         return mask
@@ -228,7 +228,7 @@ def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def _cut(
     measured: np.ndarray, mask: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
-    """The image and the mask, in some cases cut off within the thing or near to it, and their camera."""
+    """Return image, mask and camera, in some cases cropped within or near the object."""
     if rng.random() > 0.1:
         return measured, mask, camera
     v, u = np.nonzero(mask)

@@ -1,7 +1,7 @@
-"""Scenes of household things on a table: standing, lying, leaning on each other, stacked, close together.
+"""Scenes of household objects on a table: standing, lying, leaning on each other, stacked, close together.
 
 The table's frame has x to the right, y away from the camera, z up; its origin is the point that the camera looks at,
-from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Things rest in it:
+from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Objects rest in it:
 
     apart       somewhere on the table, at least 3 mm from all others
     beside      pushed along the table against another one until they touch, as seen from above
@@ -24,7 +24,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.union import flat_support, moved
+from sq_perception.geometry.union import flat_support, move
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
@@ -41,7 +41,7 @@ ELEVATION = (20.0, 70.0)
 _ROLL = float(np.deg2rad(5.0))
 _WALL = (1.8, 3.5)
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
-"""Tried; many a thing can neither lean nor be stacked where it is tried."""
+"""Tried; many an object can neither lean nor be stacked where it is tried."""
 _GAP = 0.003
 _ALONG = 1e-6
 """Component of a unit vector: what comes no nearer than this to a plane moves along it."""
@@ -60,14 +60,14 @@ _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
 
 @dataclass(frozen=True, eq=False)
 class PlacedThing:
-    """One thing of a scene.
+    """One object of a scene.
 
     Attributes
     ----------
     rest
         How it lies, and how it came there.
     rotation, translation : (4,), (3,)
-        Optical from the thing's frame.
+        Optical from the object's frame.
     label
         Its value in the label image.
     pixels
@@ -83,20 +83,20 @@ class PlacedThing:
 
     @property
     def parts(self) -> Superquadric:
-        """The thing's parts in the optical frame."""
-        return Superquadric.from_flat(moved(self.thing.parts.to_flat(), self.rotation, self.translation))
+        """The object's parts in the optical frame."""
+        return Superquadric.from_flat(move(self.thing.parts.to_flat(), self.rotation, self.translation))
 
 
 @dataclass(frozen=True, eq=False)
 class ThingsOnTable:
-    """A scene, its true image and its truth.
+    """A scene with its true image and its truth.
 
     Attributes
     ----------
     depth : float64 (height, width)
         +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
     labels : int32 (height, width)
-        True masks, 0 for what is no thing.
+        True masks, 0 for what is no object.
     plane : (4,)
         Height above the table = n.p + d.
     table : (3, 3)
@@ -116,7 +116,7 @@ class ThingsOnTable:
 
 @dataclass(frozen=True, eq=False)
 class _Resting:
-    """A thing in the table's frame, its support in ``_WAYS`` and whether something may stand on it."""
+    """An object in the table's frame, its support in ``_WAYS`` and whether others may stand on it."""
 
     thing: Thing
     rest: str
@@ -130,12 +130,12 @@ class _Resting:
         return replace(self, shift=self.shift + by, reach=self.reach + _WAYS @ by)
 
     def apart(self, other: _Resting, gap: float) -> bool:
-        """Whether a tried plane lies between both, ``gap`` wide; level ones need none."""
+        """Return whether a tried plane separates both by ``gap``; level planes need no gap."""
         free = -(self.reach + other.reach[_BACK])
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
 
-    def pushed(self, way: np.ndarray, other: _Resting) -> _Resting | None:
-        """Moved along the level ``way``, from before the other one, until it touches; None if it passes by."""
+    def push(self, way: np.ndarray, other: _Resting) -> _Resting | None:
+        """Push along the level ``way``, from before the other one, until it touches; None if it passes by."""
         gap, closing = -(other.reach + self.reach[_BACK])[:_UP], -(_WAYS[:_UP] @ way)
         comes = closing > _ALONG
         ends = (gap[comes] / closing[comes]).max()
@@ -151,14 +151,14 @@ def things_on_table(
     camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION,
 ) -> ThingsOnTable:
-    """``count`` things, or 1 to 8, on a table, all of them wholly inside the image.
+    """Place ``count`` objects, or 1 to 8, on a table, all wholly inside the image.
 
     The camera is ``elevation`` (least, greatest) degrees above the table.
 
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 8, the camera is no pinhole, or the things find no room in its image.
+        If ``count`` is not 1 to 8, the camera is no pinhole, or the objects find no room in its image.
     """
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
@@ -168,13 +168,13 @@ def things_on_table(
     for _ in range(_SCENES):
         look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
         eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
-        resting = _arranged(wanted, look, eye, camera, rng)
+        resting = _arrange(wanted, look, eye, camera, rng)
         if resting is not None:
             return _seen(resting, look, eye, camera, rng)
     raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
 
 
-def _arranged(
+def _arrange(
     count: int, look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> list[_Resting] | None:
     resting: list[_Resting] = []
@@ -183,7 +183,7 @@ def _arranged(
     while failed < _TRIES:
         failed += 1
         how = str(rng.choice(_HOW)) if resting else "apart"
-        placed = _drawn(draw_thing(rng), how, resting, spread, rng)
+        placed = _draw(draw_thing(rng), how, resting, spread, rng)
         if placed is None or not _in_view(placed, look, eye, camera):
             continue
         if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):
@@ -194,8 +194,8 @@ def _arranged(
     return None
 
 
-def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
-    """A thing placed in one of the ways of the module; None where that way is not possible."""
+def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
+    """Place an object in one of the ways of the module; None if that is not possible."""
     rest, turn = thing.pose(rng, leaning=0.0)
     bearing = rng.uniform(0, 2 * np.pi)
     way = np.array([np.cos(bearing), np.sin(bearing), 0.0])
@@ -205,7 +205,7 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
         tilt = np.array([-way[1] * np.sin(half), way[0] * np.sin(half), 0.0, np.cos(half)])
         turn = quaternions.multiply(tilt, turn)
     flat_top = thing.kind == "box" or (thing.kind == "can" and rest == "standing" and len(thing.parts) == 1)
-    turned = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    turned = move(thing.parts.to_flat(), turn, np.zeros(3))
     body = _Resting(thing, rest, turn, np.zeros(3), flat_support(turned, _WAYS), flat_top and how != "leaning")
     floor = body.reach[_DOWN]
     if how == "apart":
@@ -222,12 +222,12 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
     if other.reach[_DOWN] < -1e-3:  # itself not on the table
         return None
     reach = flat_support(turned, way[None])[0]
-    where = flat_support(moved(other.thing.parts.to_flat(), other.turn, other.shift), -way[None])[0]
+    where = flat_support(move(other.thing.parts.to_flat(), other.turn, other.shift), -way[None])[0]
     along = np.array([-way[1], way[0], 0.0])
     aside = rng.normal(0, 0.01) if how == "leaning" else rng.normal(0, 0.03)
     # The plane across ``way`` that touches the other one, and this one from the other side.
     shift = way * (-where - reach) + along * (middle @ along + aside)
-    placed = body.at(np.array([*shift[:2], floor])).pushed(way, other)
+    placed = body.at(np.array([*shift[:2], floor])).push(way, other)
     if placed is not None and how == "leaning":
         if placed.reach[_UP] > other.reach[_UP] + 0.01 or thing.kind in ("round", "soft", "union"):
             return None
@@ -236,7 +236,7 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
 
 
 def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) -> bool:
-    parts = moved(moved(body.thing.parts.to_flat(), body.turn, body.shift), look, eye)
+    parts = move(move(body.thing.parts.to_flat(), body.turn, body.shift), look, eye)
     reach = flat_support(parts, SIX_WAYS)
     if -reach[5] < _NEAREST:
         return False
@@ -254,8 +254,8 @@ def _seen(
     poses = [(quaternions.multiply(look, body.turn), table @ body.shift + eye) for body in resting]
     owner = np.concatenate([np.full(len(body.thing.parts), k) for k, body in enumerate(resting)])
     whose = np.concatenate([np.full(len(body.thing.cavities), k) for k, body in enumerate(resting)])
-    parts = [moved(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
-    holes = [moved(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
+    parts = [move(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
+    holes = [move(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
     everything, cavities = (Superquadric.from_flat(np.concatenate(flat)) for flat in (parts, holes))
     wall = rng.uniform(*_WALL)
     depth, index = render_things(everything, owner, cavities, whose, camera, plane, wall)

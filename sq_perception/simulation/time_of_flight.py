@@ -54,7 +54,7 @@ class TimeOfFlight(SensorNoise):
         face_on = 0.0015 - 0.0005 * z + 0.0003 * np.square(z)
         return face_on + 0.0001 * z * np.sqrt(z) * np.square(steepness(cosine))
 
-    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
         scene = InverseDepth.of(depth, camera)
         cosine, lost = scene.cosine(), scene.w == 0
         z = 1 / np.where(lost, np.float32(1 / self.near), scene.w)

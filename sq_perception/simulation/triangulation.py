@@ -31,7 +31,7 @@ _FARTHEST_MOVE = 4
 
 @dataclass(frozen=True)
 class Triangulation(SensorNoise):
-    """What structured light and stereo share.
+    """Common base of structured light and stereo.
 
     Attributes
     ----------
@@ -80,16 +80,16 @@ class Triangulation(SensorNoise):
         share = (angle - self.grazing) / max(self.blind - self.grazing, 1e-6)
         return np.clip(share, 0.0, 1.0) + np.zeros(np.shape(z))
 
-    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
         scene = InverseDepth.of(depth, camera)
         cosine, lost = scene.cosine(), scene.hidden_from(self.baseline)
         scene, lost = self._matched(scene, lost)
-        w, cosine, lost = self._wandered(scene, cosine, lost, rng)
+        w, cosine, lost = self._wander(scene, cosine, lost, rng)
         lost |= w == 0
         z = 1 / np.where(lost, np.float32(1 / self.near), w)
         variance = np.square(self._sigma(z, np.maximum(cosine, np.float32(1e-3))) / np.square(z))
         variance -= np.float32(self.quantum**2 / 12)
-        w = w + _averaged(rng, w.shape, self.window) * np.sqrt(np.maximum(variance, 0))
+        w = w + _average(rng, w.shape, self.window) * np.sqrt(np.maximum(variance, 0))
         if self.quantum:
             w = np.rint(w / np.float32(self.quantum)) * np.float32(self.quantum)
         lost |= (w < 1 / self.far) | (w > 1 / self.near)
@@ -98,13 +98,13 @@ class Triangulation(SensorNoise):
             return np.where(lost, np.float32(np.nan), 1 / w).astype(np.float32)
 
     def _matched(self, scene: InverseDepth, lost: np.ndarray) -> tuple[InverseDepth, np.ndarray]:
-        """What matching makes of the scene and of the pixels that are lost so far."""
+        """Return what matching makes of the scene and of the pixels lost so far."""
         return scene, lost
 
-    def _wandered(
+    def _wander(
         self, scene: InverseDepth, cosine: np.ndarray, lost: np.ndarray, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Inverse depth, cosine and lost pixels with displaced edges."""
+        """Return inverse depth, cosine and lost pixels with displaced edges."""
         if self.edge_wander == 0:
             return scene.w, cosine, lost
         brush = np.ones((2 * _FARTHEST_MOVE + 1, 2 * _FARTHEST_MOVE + 1), np.uint8)
@@ -114,7 +114,7 @@ class Triangulation(SensorNoise):
         down = np.clip(v + down, 0, cosine.shape[0] - 1) - v
         right = np.clip(u + right, 0, cosine.shape[1] - 1) - u
         w, moved_cosine, moved_lost = scene.w.copy(), cosine.copy(), lost.copy()
-        w[v, u] = scene.displaced(v, u, down, right)
+        w[v, u] = scene.shift(v, u, down, right)
         moved_cosine[v, u] = cosine[v + down, u + right]
         moved_lost[v, u] = lost[v + down, u + right]
         return w, moved_cosine, moved_lost
@@ -123,13 +123,13 @@ class Triangulation(SensorNoise):
         return self.edge_wander
 
     def _thin_out(self, lost: np.ndarray, cosine: np.ndarray, rng: np.random.Generator) -> None:
-        """Lose readings of grazing surfaces, window-sized patches of them together."""
+        """Drop readings of grazing surfaces, in window-sized patches."""
         from scipy.special import ndtri  # here: a node that recovers does without
 
         v, u = np.nonzero(~lost & (cosine < np.cos(np.radians(self.grazing))))
         if v.size:
             share = self.dropout(self.near, cosine[v, u])
-            lost[v, u] = _averaged(rng, lost.shape, self.window)[v, u] < ndtri(share)
+            lost[v, u] = _average(rng, lost.shape, self.window)[v, u] < ndtri(share)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ class StructuredLight(Triangulation):
 
 @dataclass(frozen=True)
 class Stereo(Triangulation):
-    """Two imagers, with or without a projector: sigma = z^2 subpixel / (f b).
+    """Sensor of two imagers, with or without a projector: sigma = z^2 subpixel / (f b).
 
     The match of a window takes the nearer of two surfaces in it: foregrounds are fattened, by ``fattening`` pixels all
     around, over what the second imager does not see as well.  Columns that lie outside the second image are missing: a
@@ -179,13 +179,13 @@ class Stereo(Triangulation):
         column = np.arange(scene.w.shape[1], dtype=np.float32) - scene.w * np.float32(scene.camera.fx * self.baseline)
         outside = (column < 0) | (column > scene.w.shape[1] - 1)
         if self.fattening:
-            scene, covered = scene.fattened(self.fattening)
+            scene, covered = scene.dilate(self.fattening)
             lost = lost & ~covered
         return scene, lost | outside
 
 
-def _averaged(rng: np.random.Generator, shape: tuple[int, ...], window: tuple[int, int]) -> np.ndarray:
-    """Normal numbers (height, width) of variance 1, averaged over a window (columns, rows)."""
+def _average(rng: np.random.Generator, shape: tuple[int, ...], window: tuple[int, int]) -> np.ndarray:
+    """Average normal numbers (height, width) over a window (columns, rows), with variance 1."""
     columns, rows = window
     height, width = shape[0] + rows - 1, shape[1] + columns - 1
     white = rng.standard_normal((height, width), dtype=np.float32)

@@ -1,11 +1,11 @@
-"""Canonical views of known bodies, rendered without the detour over an image: the source of training data.
+"""Canonical views of known bodies, rendered directly without an image: the source of training data.
 
-What :mod:`sq_perception.imaging.canonical_view` makes of an image of a body is rendered directly: rays along z on the
-view's own grid, the view fitted to what of the body is visible.  Frames and values are those of that module.
+The views equal those that :mod:`sq_perception.imaging.canonical_view` makes of images: rays along z on the view's own
+grid, fitted to the visible part of the body.  Frames and values are those of that module.
 
-A canonical view is orthographic whatever camera took the image, but a pinhole camera sees less of a body: of a convex
-one just the points whose normals point to the camera.  So the rays along z, less those that meet a point that faces
-away from it, show what the view of an image with any number of pixels does.
+A canonical view is orthographic for any camera, but a pinhole camera sees less of a body: of a convex one only points
+whose normals point to the camera.  So the rays along z, without those that meet a point facing away from the camera,
+show the same as the view of an image of any resolution.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _Curtain: TypeAlias = tuple[float, float, float, float]
 
 
 class Occluder(NamedTuple):
-    """Something opaque before each body (n,): all that lies beyond a front that came in from one side.
+    """An opaque occluder before each body (n,): all that lies beyond a front from one side.
 
     In the plane of the view, in units of its side and from its middle, (u, v) are coordinates along and across the
     direction the occluder comes from; hidden is
@@ -39,7 +39,7 @@ class Occluder(NamedTuple):
         c < u - bow |v - offset|^power < c + thickness,
 
     c such that ``share`` of the body's pixels lie beyond the front.  bow = 0 is a straight edge, power 1 a corner,
-    power 2 a round thing.
+    power 2 a round object.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ def _render_views(
     misses: np.ndarray,
     images: np.ndarray,
 ) -> None:
-    """All images; ``anchor`` and ``side`` become those of the views."""
+    """Render all images; ``anchor`` and ``side`` become those of the views."""
     for k in numba.prange(flat.shape[0]):
         sensed = pinhole[k], eye[k], quantum[k]
         side[k] = _render_view(flat[k], matrices[k], anchor[k], side[k], sensed, fronts[k], misses[k], images[k])
@@ -148,7 +148,7 @@ def _render_view(
     miss: np.ndarray,
     image: np.ndarray,
 ) -> float:
-    """Render, read off what is visible, and render again until the extent is that of the visible part: the side."""
+    """Render, find the visible extent, and render again until the extent is the view's side."""
     pixels = image.shape[0]
     surface, reach = np.empty((pixels, pixels)), np.empty((pixels, pixels))
     is_occluded, is_missed = front[5] > 0.0, np.any(miss != 0.0)
@@ -201,7 +201,7 @@ def _cast(
     surface: np.ndarray,
     reach: np.ndarray,
 ) -> None:
-    """What the rays of a view meet: z of the body, :data:`_NOTHING`, or :data:`_BEHIND` an occluder.
+    """Return what the rays of a view meet: z of the body, :data:`_NOTHING`, or :data:`_BEHIND` an occluder.
 
     ``reach`` becomes how far in the occluder's direction they are, if there is one.
     """
@@ -237,21 +237,21 @@ def _cast(
 
 @kernel
 def _limits(surface: np.ndarray) -> tuple[int, int, int, int]:
-    """First and last row, first and last column in which something is seen."""
+    """Return first and last row, first and last column with a visible point."""
     rows, columns = np.nonzero(surface > _NOTHING)
     return int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())
 
 
 @kernel
 def _begins(surface: np.ndarray, reach: np.ndarray, share: float) -> float:
-    """How far in its direction an occluder begins, so that this share of what is seen lies beyond."""
+    """Return where an occluder begins in its direction, so that this share of the visible part lies beyond."""
     seen = np.sort(reach.ravel()[surface.ravel() > _NOTHING])
     return seen[int((1.0 - share) * (len(seen) - 1))] if len(seen) else np.inf
 
 
 @kernel
 def _front_distance(x: float, y: float, front: np.ndarray) -> float:
-    """How far a point of the view lies in the direction of an occluder, its bow taken off; see :class:`Occluder`."""
+    """Return a point's coordinate in an occluder's direction, less its bow; see :class:`Occluder`."""
     cosine, sine = np.cos(front[0]), np.sin(front[0])
     across = abs(cosine * y - sine * x - front[2])
     return cosine * x + sine * y - front[1] * across ** front[3]

@@ -175,7 +175,7 @@ class TrackingSession:
                 body, covariance = _in_form_of(body, covariance, observation)
             elif not np.isfinite(observation.covariance).all():
                 covariance = np.full((LENGTH, LENGTH), np.nan)
-            body = _tapered_like(body, observation.superquadric)
+            body = _taper_like(body, observation.superquadric)
             found.append(Followed(track.id, track.seen, is_fused, body, covariance))
         return tuple(found)
 
@@ -187,7 +187,7 @@ class TrackingSession:
         return self._tracker
 
 
-def _tapered_like(body: Superquadric, observed: Superquadric) -> Superquadric:
+def _taper_like(body: Superquadric, observed: Superquadric) -> Superquadric:
     """An untapered body in the box of the observed one, with its taper where both have the same z axis."""
     turn = np.round(body.rotation_matrix.T @ observed.rotation_matrix)
     if not observed.is_tapered or abs(turn[2, 2]) != 1:

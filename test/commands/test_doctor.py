@@ -15,7 +15,7 @@ def test_the_doctor_names_versions_cores_weights_and_kernels(capsys):
     said = dict(line.split(None, 1) for line in capsys.readouterr().out.splitlines())
     assert __version__ in said["program"]
     assert said["cores"].startswith(f"{len(os.sched_getaffinity(0))} of ")
-    assert {"numpy", "[bags]", "[exr]", "[cluster]", "[train]", "[ros]", "kernels"} <= said.keys()
+    assert {"numpy", "[bags]", "[exr]", "[train]", "[ros]", "kernels"} <= said.keys()
     assert "robust" in said["weights"]
 
 

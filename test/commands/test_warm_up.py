@@ -11,7 +11,7 @@ from sq_perception.commands import warm_up
 from sq_perception.fitting import levenberg_marquardt
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
-from sq_perception.simulation.crowds import crowded_scene
+from sq_perception.simulation.crowds import draw_crowd
 from sq_perception.simulation.scenes import TABLE_CAMERA, table_scene
 
 
@@ -39,7 +39,7 @@ def test_frames_call_no_kernel_that_the_warm_up_did_not_compile() -> None:
         assert recoverer.recover(depth.astype(np.float32), camera).bodies
         depth[:, 1 : camera.width : 8] = np.nan  # as sensors have holes
         assert recoverer.recover(depth, camera).bodies
-    touching, _ = crowded_scene(np.random.default_rng(1), 6, TABLE_CAMERA).render()
+    touching, _ = draw_crowd(np.random.default_rng(1), 6, TABLE_CAMERA).render()
     assert recoverer.recover(touching.astype(np.float32), TABLE_CAMERA).bodies
     assert {name: new for name, of in compiled().items() if (new := of - known.get(name, set()))} == {}
     # One form of arguments, whatever array a hull's directions came in: a second one takes 18 s and 13 MB.

@@ -251,7 +251,7 @@ def test_examples_are_chosen_by_rank() -> None:
 
     for count in (1, 2, 5, 9, 40):
         (outcome,) = contest.compare([(Scripted("x", change), count)], ThesisImages(count))
-        groups = evaluation_pictures.ranked(outcome)
+        groups = evaluation_pictures.rank(outcome)
         numbers = [number for group in groups.values() for number in group]
         assert len(set(numbers)) == len(numbers) == min(count, 9) or count in (2, 5)
         assert outcome.figures.iou[groups["best"][0]] == outcome.figures.iou.max()

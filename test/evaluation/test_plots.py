@@ -97,7 +97,7 @@ def test_grippers_beyond_the_image_are_shown_whole_and_a_body_without_grasp_says
         assert frame.x0 <= box.x0 < box.x1 <= frame.x1
         assert frame.y0 <= box.y0 < box.y1 <= frame.y1
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
-    wires = CAMERA.project(np.concatenate([grasp.placed(line) for line in PANDA.wires(grasp.opening)]))
+    wires = CAMERA.project(np.concatenate([grasp.to_body_frame(line) for line in PANDA.wires(grasp.opening)]))
     assert wires[:, 1].min() < 0, "beyond the image"
     assert ((wires >= [left, top]) & (wires <= [right, bottom])).all()
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 import sq_perception
-from sq_perception.geometry import kernels
+from sq_perception.commands import warm_up
+from sq_perception.geometry import kernel_cache, kernels
 
 PATIENCE = 600
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"'
@@ -139,7 +140,22 @@ def test_the_name_of_a_kernel_follows_what_its_module_imports(tmp_path: Path, mo
         if name:
             (package / name).write_text(sources[name] + "# changed\n")
         kernels._fingerprint.cache_clear()
-        kernels._imported.cache_clear()
+        kernels._find_imports.cache_clear()
         kept[name] = kernels._fingerprint(package / "fitting" / "residuals.py")
     assert kept["geometry/mesh.py"] == kept[""] == kept["geometry/ray.py"]
     assert len({kept[name] for name in ("fitting/residuals.py", "fitting/terms.py", "geometry/ray.py")}) == 3
+
+
+@pytest.mark.parametrize(("cores", "count"), [({0, 1}, 1), ({0}, 0)])
+def test_a_second_process_compiles_beside_a_command_where_there_is_a_core(monkeypatch, cores, count):
+    started: list[list[str]] = []
+    monkeypatch.setattr(kernel_cache.subprocess, "Popen", lambda command, **_: started.append(command))
+    monkeypatch.setattr(kernel_cache.os, "sched_getaffinity", lambda _: cores)
+    monkeypatch.setattr(kernel_cache, "_is_shared", False)
+    kernel_cache._announce.__wrapped__()
+    assert not started, "a script compiles by itself"
+    kernel_cache.compile_beside()
+    kernel_cache._announce.__wrapped__()
+    assert len(started) == count
+    names = [name for name, _ in warm_up.steps()]
+    assert all(set(command[5:]) <= set(names) for command in started)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sq_perception.geometry.quantiles import densest, quantile, ranked
+from sq_perception.geometry.quantiles import densest, quantile, select
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 100])
@@ -19,7 +19,7 @@ def test_numpy_says_the_same(count: int, rng: np.random.Generator) -> None:
 def test_counting_finds_what_sorting_does(count: int, rng: np.random.Generator) -> None:
     numbers = np.abs(rng.standard_normal(count)).astype(np.float32)
     for rank in (0, count // 2, count - 1):
-        assert ranked(numbers, rank) == np.sort(numbers)[rank]
+        assert select(numbers, rank) == np.sort(numbers)[rank]
 
 
 def test_the_densest_place_is_the_first_that_holds_most() -> None:

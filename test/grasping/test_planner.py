@@ -109,9 +109,9 @@ def test_the_gripper_stands_off_the_body_and_the_table():
         for grasp in plan(body).grasps:
             corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
             for box in PANDA.boxes(grasp.opening):
-                inside = grasp.placed(box[:3] + np.random.default_rng(0).uniform(-1, 1, (500, 3)) * box[3:])
+                inside = grasp.to_body_frame(box[:3] + np.random.default_rng(0).uniform(-1, 1, (500, 3)) * box[3:])
                 assert body.gauge(inside).min() > 1.0
-                assert grasp.placed(box[:3] + corners * box[3:])[:, 2].min() > 0.0
+                assert grasp.to_body_frame(box[:3] + corners * box[3:])[:, 2].min() > 0.0
 
 
 def test_what_is_wider_than_the_opening_is_never_tried():
@@ -308,9 +308,9 @@ def test_places_are_hidden_that_the_image_does_not_show_to_be_empty():
     around = Surroundings(depth=depth, camera=camera)
     before, behind, dark, outside = [0.1, 0.0, 0.9], [0.1, 0.0, 1.1], [-0.1, 0.0, 0.9], [0.9, 0.0, 0.9]
     np.testing.assert_allclose(
-        around.hidden(np.array([[before, before], [before, behind], [dark, outside]])), [0, 0.5, 1]
+        around.hidden_share(np.array([[before, before], [before, behind], [dark, outside]])), [0, 0.5, 1]
     )
-    assert Surroundings().hidden(np.array([before])) == 1
+    assert Surroundings().hidden_share(np.array([before])) == 1
 
 
 def test_gaps_between_readings_hide_nothing_and_are_no_points():
@@ -320,7 +320,7 @@ def test_gaps_between_readings_hide_nothing_and_are_no_points():
     depth = np.where((row % 3 == 0) & (column % 3 == 0), 1.0, np.nan)
     around = Surroundings.of_image(depth, camera, None)
     places = np.array([[x, y, z] for x in (-0.31, -0.1, 0.2) for y in (-0.2, 0.11) for z in (0.9, 1.1)])
-    np.testing.assert_allclose(around.hidden(places.reshape(2, -1, 3)), 0.5)
+    np.testing.assert_allclose(around.hidden_share(places.reshape(2, -1, 3)), 0.5)
     np.testing.assert_allclose(around.beyond(places), 1.0 - places[:, 2])
     assert len(around.points) == np.count_nonzero(np.isfinite(depth))
 

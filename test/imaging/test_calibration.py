@@ -91,15 +91,15 @@ def test_which_image_it_is(changes, name, distortion, raw, camera, rng):
     if not raw:
         assert calibration.rectification is None
         assert calibration.camera == camera
-        assert calibration.rectified(depth) is depth
-        assert calibration.rectified_labels(labels) is labels
+        assert calibration.rectify(depth) is depth
+        assert calibration.rectify_labels(labels) is labels
         assert calibration.as_sent(depth) is depth
         return
     undone = Rectification(camera, Distortion(info.distortion_model, info.d))
     assert calibration.rectification == undone
     assert calibration.camera == undone.camera != camera
-    np.testing.assert_array_equal(calibration.rectified(depth), undone.there.depth(depth))
-    np.testing.assert_array_equal(calibration.rectified_labels(labels), undone.there.labels(labels))
+    np.testing.assert_array_equal(calibration.rectify(depth), undone.there.depth(depth))
+    np.testing.assert_array_equal(calibration.rectify_labels(labels), undone.there.labels(labels))
     seen = np.ones((undone.camera.height, undone.camera.width), np.float32)
     assert calibration.as_sent(seen).shape == depth.shape
 
@@ -165,7 +165,7 @@ def test_a_part_far_from_the_axis_is_seen_too():
     for corner in ((0, 0), (540, 400)):
         calibration = Calibration.of(replace(INFO, roi=Region(*corner, 100, 80)), "", "apply")
         assert share_seen(calibration.rectification) == 1
-        assert np.isfinite(calibration.rectified(np.ones((80, 100)))).mean() > 0.75
+        assert np.isfinite(calibration.rectify(np.ones((80, 100)))).mean() > 0.75
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_a_part_far_from_the_axis_is_seen_too():
 @pytest.mark.parametrize("distortion", ["apply", "ignore"])
 def test_images_that_do_not_fit_say_what_may_be_the_reason(shape, words, distortion):
     calibration = Calibration.of(INFO, "", distortion)
-    for call in (calibration.rectified, calibration.rectified_labels):
+    for call in (calibration.rectify, calibration.rectify_labels):
         with pytest.raises(ValueError, match=f"camera_info: does not fit: .*{words}"):
             call(np.ones(shape))
     with pytest.raises(ValueError, match="does not fit"):

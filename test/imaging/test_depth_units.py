@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.depth_units import UnitsError, metres, stated, wrong_unit, z_from_range
+from sq_perception.imaging.depth_units import UnitsError, metres, parse_scale, wrong_unit, z_from_range
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 
@@ -102,17 +102,17 @@ def test_raw_disparities_of_a_kinect_are_refused(table):
     [(0.1, 1e4), (1.0, 1e3), (0.001, 1e3), (0.000125, 8e3), (0.00025, 4e3), (1e-4, 1e4), (5000.0, 5e3), (1000, 1e3)],
 )
 def test_conventions_of_a_stated_unit_are_told_apart_by_magnitude(value, scale):
-    assert stated(value, "depth_scale").scale == pytest.approx(scale)
+    assert parse_scale(value, "depth_scale").scale == pytest.approx(scale)
 
 
 @pytest.mark.parametrize("value", [0.0, -0.1, np.inf, np.nan])
 def test_a_unit_that_is_none_is_refused(value):
     with pytest.raises(ValueError, match="positive number"):
-        stated(value, "depth_scale")
+        parse_scale(value, "depth_scale")
 
 
 def test_a_stated_unit_is_of_whole_numbers_and_the_callers_goes_before(table):
-    known = stated(0.1, "depth_scale")
+    known = parse_scale(0.1, "depth_scale")
     whole = np.round(1e4 * table).astype(np.uint16)
     found = metres(whole, known=known)
     np.testing.assert_allclose(found.depth, table, atol=1e-4)

@@ -119,15 +119,15 @@ class TestHiddenPixels:
 class TestWear:
     def test_seeded_and_off_by_default(self) -> None:
         views, _ = draw_views(16, np.random.default_rng(7))
-        assert Disturbance().applied(views, np.random.default_rng(0)) is views
+        assert Disturbance().apply(views, np.random.default_rng(0)) is views
         worn = Disturbance(noisy_share=1.0)
-        first, second = (worn.applied(views, np.random.default_rng(1)) for _ in range(2))
+        first, second = (worn.apply(views, np.random.default_rng(1)) for _ in range(2))
         np.testing.assert_array_equal(first, second)
         assert (first != views).any(axis=(1, 2)).mean() > 0.9
 
     def test_stays_a_view(self) -> None:
         views, _ = draw_views(64, np.random.default_rng(8), ViewSource(disturbance=Disturbance(occluded_share=0.5)))
-        worn = Disturbance(noisy_share=1.0).applied(views, np.random.default_rng(2))
+        worn = Disturbance(noisy_share=1.0).apply(views, np.random.default_rng(2))
         assert worn.dtype == np.float32
         assert np.isin(worn[worn <= 0], [0, np.float32(HIDDEN)]).all()
         assert worn.max() <= 1
@@ -139,7 +139,7 @@ class TestWear:
     def test_noise_has_the_size_it_says(self) -> None:
         """The typical change is the median of a log-uniform sigma, times that of |normal|."""
         views, _ = draw_views(200, np.random.default_rng(9))
-        worn = Disturbance(noisy_share=1.0).applied(views, np.random.default_rng(3))
+        worn = Disturbance(noisy_share=1.0).apply(views, np.random.default_rng(3))
         both = (views > 0) & (worn > 0)
         change = np.array([np.median(np.abs(w - v)[b]) for w, v, b in zip(worn, views, both, strict=True)])
         assert 0.5 < np.median(change) / (np.sqrt(0.03 / 2000) * 0.6745) < 2

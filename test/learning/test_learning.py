@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.choices import UNSUPERVISED
-from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views, moved_bodies, moved_images
+from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views, move_bodies, move_images
 from sq_perception.learning.disturbance import any_occluder
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -44,7 +44,7 @@ class TestData:
         rng = np.random.default_rng(4)
         images, bodies = draw_views(48, rng)
         turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
-        turned, moved = moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+        turned, moved = move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
         again, _ = view_rendering.render_views(moved)
         assert ((again > 0) != (turned > 0)).mean() < 0.001
         assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
@@ -91,8 +91,8 @@ class TestNetwork:
         assert (iou > 0.85).mean() > over_85
 
     def test_names_of_shipped_weights_stand_for_their_files(self, tmp_path: Path) -> None:
-        assert set(checkpoint.shipped()) == {"masks", "robust", "supervised", "things"}
-        assert checkpoint.resolve() == checkpoint.shipped()[checkpoint.DEFAULT]
+        assert set(checkpoint.shipped_weights()) == {"masks", "robust", "supervised", "things"}
+        assert checkpoint.resolve() == checkpoint.shipped_weights()[checkpoint.DEFAULT]
         assert checkpoint.resolve("supervised").is_file()
         assert checkpoint.resolve(tmp_path / "supervised.safetensors") == tmp_path / "supervised.safetensors"
         with pytest.raises(checkpoint.CheckpointError, match="no such model file"):

@@ -74,7 +74,7 @@ class TestDualLoss:
         torch.testing.assert_close(dual, losses.parameter_loss(guess, truth) + rotation)
         same_rotation = Superquadric(guess.size, guess.shape, guess.translation, truth.rotation)
         assert losses.rotation_loss(same_rotation, truth, self.POINTS, 10.0).max() == 0
-        same_rest = losses.turned_truth(guess, truth)
+        same_rest = losses.turn_truth(guess, truth)
         assert losses.parameter_loss(same_rest, truth).max() == 0
         torch.testing.assert_close(rotation, losses.occupancy_loss(same_rest, truth, self.POINTS, 10.0))
 

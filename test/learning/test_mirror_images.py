@@ -25,11 +25,11 @@ def random(count: int, rng: np.random.Generator) -> Superquadric:
 def test_the_mirror_image_of_a_body_is_that_of_its_picture() -> None:
     """Both rendered in the unit cube; a pixel beside the outline may fall to either side."""
     bodies = random(6, np.random.default_rng(0))
-    for body, other in zip(bodies, mirror_images.mirrored(bodies), strict=True):
+    for body, other in zip(bodies, mirror_images.mirror(bodies), strict=True):
         seen, turned = (render(unit_cube.optical_from_cube(each), CAMERA)[0] for each in (body, other))
         alike = np.isclose(seen[:, ::-1], turned, atol=0.02) | (np.isinf(seen[:, ::-1]) & np.isinf(turned))
         assert alike.mean() > 0.99
-    np.testing.assert_allclose(mirror_images.mirrored(mirror_images.mirrored(bodies)).to_flat(), bodies.to_flat())
+    np.testing.assert_allclose(mirror_images.mirror(mirror_images.mirror(bodies)).to_flat(), bodies.to_flat())
 
 
 def test_the_mean_of_forms_of_a_body_is_the_body() -> None:
@@ -81,6 +81,6 @@ def test_a_network_is_shown_both_views_as_one_batch() -> None:
         ones = np.ones((len(batch), 1))
         return Superquadric(ones * [0.1, 0.2, 0.3], ones * [0.5, 0.5], place, ones * [0.0, 0.0, 0.0, 1.0])
 
-    found = mirror_images.predicted_both_ways(predict, views)
+    found = mirror_images.predict_with_mirror(predict, views)
     assert shown == [4]
     np.testing.assert_allclose(found.translation[:, 0], [1.5 / 8, 6.5 / 8])

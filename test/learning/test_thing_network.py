@@ -19,7 +19,7 @@ from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, shard_training, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
 from sq_perception.learning.mask_network import MaskNetwork
-from sq_perception.learning.network_config import mirrored_planes
+from sq_perception.learning.network_config import mirror_planes
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.learning.training_config import THING_RUN
 from sq_perception.learning.training_state import TrainingState
@@ -102,7 +102,7 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
     views, planes = rng.random((2, 64, 64)).astype(np.float32), rng.standard_normal((2, 4))
     extents = np.array([0.1, 0.0])
     straight = predictor.predict(views, planes, extents)
-    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), mirrored_planes(planes), extents)
+    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), mirror_planes(planes), extents)
     back = mirrored(0)
     assert turned.support[:, back] == pytest.approx(straight.support, abs=1e-5)
     assert turned.covariance[:, back][:, :, back] == pytest.approx(straight.covariance, abs=1e-5)
@@ -111,7 +111,7 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
 
 def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
     plane, points = rng.standard_normal(4), rng.random((10, 3))
-    there = mirrored_planes(plane[None])[0]
+    there = mirror_planes(plane[None])[0]
     moved = points * [-1, 1, 1] + [1, 0, 0]
     assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
 
@@ -203,10 +203,10 @@ def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
     tails = np.sqrt(SMALL.freedom / rng.chisquare(SMALL.freedom, count))
     truth = (said.support.numpy() + tails[:, None] * normal).astype(np.float32)
     views = ThingViews(images, planes, extents, truth, np.zeros(count, np.int64))
-    spread = thing_training.calibrated_spread(network, views)
+    spread = thing_training.calibrate_spread(network, views)
     assert spread == pytest.approx(0.25, rel=0.15)
     network.config = replace(network.config, spread=spread)
-    assert thing_training.calibrated_spread(network, views) == pytest.approx(spread, rel=0.01)
+    assert thing_training.calibrate_spread(network, views) == pytest.approx(spread, rel=0.01)
 
 
 def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

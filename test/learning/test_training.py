@@ -22,8 +22,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
-from sq_perception.learning.fixed_set import Settings, generate
-from sq_perception.learning.mirror_images import predicted_both_ways
+from sq_perception.learning.mirror_images import predict_with_mirror
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig, cosine
 from sq_perception.learning.training_state import mixed_precision
@@ -57,7 +56,7 @@ def endless(folder: Path, validation: int) -> list[str]:
 
 
 class TestConfig:
-    @pytest.mark.parametrize("name", training_config.shipped())
+    @pytest.mark.parametrize("name", training_config.shipped_names())
     def test_shipped_files_are_configurations(self, name: str) -> None:
         assert isinstance(training_config.read(name), TrainingConfig)
 
@@ -88,7 +87,6 @@ class TestConfig:
             ("a: [", "not a YAML file"),
             ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
             ("framing: full\npinhole_share: 0.5", "orthographic"),
-            ("data: set\nnoisy_share: 0.5", "expected shares of 0"),
             ("sharpness_start: -5", "sharpness_start: expected a finite number"),
             ("seed: 18446744073709551616", "seed: expected a number below 2\\^63"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
@@ -137,19 +135,19 @@ class TestSchedule:
     def test_plateau_divides_after_ten_and_ends_after_twenty(self) -> None:
         schedule = Plateau()
         for loss in (3.0, 2.0):
-            schedule.validated(loss)
+            schedule.record(loss)
         for _ in range(9):
-            schedule.validated(2.0)
+            schedule.record(2.0)
         assert schedule.share == 1.0
-        schedule.validated(2.5)
+        schedule.record(2.5)
         assert schedule.share == pytest.approx(0.1)
         continued = replace(schedule)
         for _ in range(10):
             assert not continued.exhausted
-            continued.validated(2.0)
+            continued.record(2.0)
         assert continued.exhausted
         assert continued.share == pytest.approx(0.01)
-        schedule.validated(1.0)
+        schedule.record(1.0)
         assert not schedule.exhausted
 
     def test_plateau_ends_a_run(self, tmp_path: Path) -> None:
@@ -313,7 +311,7 @@ class TestContinuation:
 
 
 class TestThesisSetting:
-    """ResNet-18 on full frames, here of 64 pixels; drawn on the fly, and from a fixed set."""
+    """ResNet-18 on full frames, here of 64 pixels."""
 
     FORM = replace(RegressorConfig.thesis(), pixels=64)
     RUN = replace(training_config.read("thesis"), steps=3, batch=4, points=32, validation=3, threads=1)
@@ -328,7 +326,7 @@ class TestThesisSetting:
         # Pixels of both sizes lie at column / (n - 1); nearest neighbours make the small frame of the large one.
         chosen = np.rint(np.linspace(0, 255, 64)).astype(int)
         expected = unit_cube.optical_from_cube(
-            predicted_both_ways(model.predict, frame[None][:, chosen][:, :, chosen])
+            predict_with_mirror(model.predict, frame[None][:, chosen][:, :, chosen])
         )[0]
         assert volume_iou(body, expected) > 0.999
 
@@ -338,11 +336,3 @@ class TestThesisSetting:
         depth, labels = np.full((48, 64), 0.8, np.float32), np.ones((48, 64), np.int32)
         with pytest.raises(ValueError, match="orthographic"):
             recoverer.recover(depth, Camera(64, 48, 50, 50, 32, 24), labels)
-
-    def test_from_a_fixed_set(self, tmp_path: Path) -> None:
-        generate(tmp_path / "set", Settings("full", 64, train=24, test=0, seed=1))
-        train.train(replace(self.RUN, data=str(tmp_path / "set")), tmp_path / "run", self.FORM)
-        assert log_of(tmp_path / "run")[-1]["step"] == 3
-        other = replace(RUN, data=str(tmp_path / "set"))
-        with pytest.raises(ValueError, match="expected cropped views of 32 pixels, got full ones of 64"):
-            train.train(other, tmp_path / "other", SMALL)

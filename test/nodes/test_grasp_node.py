@@ -245,16 +245,16 @@ def test_markers_go_with_the_node_that_shows_them(bench):
 
 def test_a_cloud_that_is_planned_while_the_node_is_deactivated_is_dropped(bench, monkeypatch):
     """Deactivated between the plan and its publication: no refusal, no grasps, and the next activation answers."""
-    planned, said = grasp_node.planned, []
+    planned, said = grasp_node.plan, []
 
     def deactivated(*given):
         assert bench.node._change("deactivate")
         return planned(*given)
 
     with monkeypatch.context() as patched:
-        patched.setattr(grasp_node, "planned", deactivated)
+        patched.setattr(grasp_node, "plan", deactivated)
         patched.setattr(bench.node.get_logger(), "warning", lambda text, **_: said.append(text))
-        assert bench.node._answered(to_message(bodies(), HEADER)) == (None, "the node is inactive")
+        assert bench.node._answer(to_message(bodies(), HEADER)) == (None, "the node is inactive")
     assert not said
     assert bench.node._change("activate")
     bench.until(lambda: all(one.get_subscription_count() for one in bench.node._outputs))

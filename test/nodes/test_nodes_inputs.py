@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,12 +13,14 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from frame_node_bench import CAMERA
+from geometry_msgs.msg import TransformStamped
 from packed_depth import pack
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_to_message, labels_to_message
+from sq_perception.geometry import rotation as quaternions
 
 
 def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
@@ -94,13 +98,15 @@ def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_
     assert (rendered[-1].width, rendered[-1].height) == (64, 48)
 
 
-def cloud(points: np.ndarray, header: Header) -> PointCloud2:
+def cloud(points: np.ndarray, header: Header, labels: np.ndarray | None = None) -> PointCloud2:
     """As drivers send (height, width, 3): coordinates among other fields, points and rows padded."""
     height, width, _ = points.shape
-    layout = {"names": ["rgb", "x", "y", "z"], "formats": ["<u4", "<f4", "<f4", "<f4"], "offsets": [0, 4, 8, 16]}
+    first = "rgb" if labels is None else "label"
+    layout = {"names": [first, "x", "y", "z"], "formats": ["<u4", "<f4", "<f4", "<f4"], "offsets": [0, 4, 8, 16]}
     rows = np.zeros((height, width + 3), np.dtype({**layout, "itemsize": 32}))
     for k, name in enumerate("xyz"):
         rows[name][:, :width] = points[..., k]
+    rows[first][:, :width] = 0 if labels is None else labels
     found = PointCloud2(header=header, height=height, width=width, point_step=32, row_step=32 * (width + 3))
     kinds = (PointField.UINT32, *[PointField.FLOAT32] * 3)
     found.fields = [
@@ -173,3 +179,52 @@ def test_a_cloud_that_is_no_image_has_pixels_of_no_mask(make_bench):
     assert (counts.answered, counts.refused) == (1, 0), counts.last_error
     assert bench.recoverer.asked[-1][2] is None
     assert "mask: expected an image or an organised cloud" in decided("always").last_error
+
+
+def test_labels_of_points_are_masks_and_points_of_another_frame_are_moved_by_tf(make_bench, monkeypatch):
+    """A labelled cloud of the robot's frame: seen from the camera, with masks, and without either in plain words."""
+    turn, place = quaternions.normalize(np.array([0.6, -0.5, 0.4, -0.5])), np.array([0.3, -0.4, 1.2])
+
+    def lookup_transform(target: str, source: str, stamp: Any, patience: Any) -> TransformStamped:
+        if (target, source) != ("camera_optical", "base"):
+            raise LookupError(f"{source} is not connected")
+        found = TransformStamped()
+        part, shift = found.transform.rotation, found.transform.translation
+        part.x, part.y, part.z, part.w = turn
+        shift.x, shift.y, shift.z = place
+        return found
+
+    buffer = SimpleNamespace(lookup_transform=lookup_transform, clear=lambda: None)
+    stand_in = SimpleNamespace(
+        Buffer=lambda: buffer, TransformListener=lambda *_: SimpleNamespace(unregister=lambda: None)
+    )
+    monkeypatch.setitem(sys.modules, "tf2_ros", stand_in)
+    bench = make_bench("-p", "image_transport:=points", "-p", "camera_frame:=camera_optical")
+    clouds = bench.peer.create_publisher(PointCloud2, "depth/points", 5)
+    bench.until(clouds.get_subscription_count)
+    depth = 0.5 + 0.003 * np.random.default_rng(5).random((48, 64))
+    v, u = np.mgrid[:48, :64]
+    seen = CAMERA.unproject(u, v, depth)
+    there = (seen - place) @ quaternions.to_matrix(turn)
+    labels = (u // 32 + 1).astype(np.int32)
+
+    def labelled(frame_id: str) -> PointCloud2:
+        header = bench.header()
+        header.frame_id = frame_id
+        return cloud(there, header, labels)
+
+    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
+    clouds.publish(labelled("base"))
+    bench.until(lambda: bench.answers)
+    assert bench.answers[-1].header.frame_id == "camera_optical"
+    image, camera, masks, _ = bench.recoverer.asked[-1]
+    np.testing.assert_allclose(image, depth, rtol=1e-5)
+    assert camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
+    np.testing.assert_array_equal(masks, labels)
+    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
+    clouds.publish(labelled("base"))
+    bench.until(lambda: len(bench.answers) == 2)
+    assert bench.recoverer.asked[-1][2] is None
+    clouds.publish(labelled("map"))
+    bench.until(lambda: bench.counts.refused)
+    assert "camera_frame: expected a transform from 'map' to 'camera_optical'" in bench.counts.last_error

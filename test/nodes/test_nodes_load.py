@@ -191,7 +191,7 @@ def change(path: Path, kind: str, node: Child) -> None:
     """What happens to a file while somebody has it loaded; written in place, as a careless copy does."""
     content = path.read_bytes()
     if kind == "other weights":
-        path.write_bytes(checkpoint.shipped()["supervised"].read_bytes())
+        path.write_bytes(checkpoint.shipped_weights()["supervised"].read_bytes())
     elif kind == "half of it":
         path.write_bytes(content[: len(content) // 2])
     elif kind == "noise":

@@ -465,15 +465,15 @@ def test_markers_that_are_gone_are_deleted_for_a_while_and_all_of_them_at_once(m
     now = [100.0]
     monkeypatch.setattr(outputs_module, "monotonic", lambda: now[0])
     ids = MarkerIds()
-    assert ids.replaced([1, 2]) == []
+    assert ids.replace_markers([1, 2]) == []
     now[0] += 60
-    assert [ids.replaced([1]), ids.replaced([1])] == [[2], [2]], "however long they were shown"
-    assert [ids.replaced([2]), ids.replaced([2])] == [[1], [1]], "2 is back"
+    assert [ids.replace_markers([1]), ids.replace_markers([1])] == [[2], [2]], "however long they were shown"
+    assert [ids.replace_markers([2]), ids.replace_markers([2])] == [[1], [1]], "2 is back"
     now[0] += 10.5
-    assert ids.replaced([2]) == []
-    ids.replaced(range(50))
-    assert sorted(ids.replaced([])) == list(range(50))
-    assert 0 < len(ids.replaced([])) < 50
+    assert ids.replace_markers([2]) == []
+    ids.replace_markers(range(50))
+    assert sorted(ids.replace_markers([])) == list(range(50))
+    assert 0 < len(ids.replace_markers([])) < 50
 
 
 def test_markers_lie_on_the_bodies(node):

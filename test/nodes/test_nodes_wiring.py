@@ -29,7 +29,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, frame_node
 from sq_perception.nodes import input as input_module
-from sq_perception.nodes.frame import latched, stamp_of
+from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.statistics import WITHOUT_MASK
 
 
@@ -565,7 +565,7 @@ def test_the_support_plane_of_a_frame_is_there_before_its_bodies(bench):
     planes: list[Any] = []
     pairs: list[tuple[Any, Any]] = []
     bench.recoverer.plane = np.array([0.0, -0.8, -0.6, 0.5])
-    bench.peer.create_subscription(PoseStamped, "recover_node/support_plane", planes.append, latched())
+    bench.peer.create_subscription(PoseStamped, "recover_node/support_plane", planes.append, latched_qos())
 
     def plan(message: PointCloud2) -> None:
         pairs.append((message.header, planes[-1].header if planes else None))

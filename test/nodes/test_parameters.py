@@ -59,10 +59,9 @@ def test_the_shipped_file_holds_every_parameter_with_its_default(name, repositor
 def test_the_reference_is_what_the_generator_writes(repository, monkeypatch):
     monkeypatch.syspath_prepend(repository / "docs_build")
     reference: Any = importlib.import_module("parameter_reference")
-    assert (repository / reference.PAGE).read_text(encoding="utf-8") == reference.page()
     for name in KINDS:
         written = (repository / "config" / f"{name}.yaml").read_text(encoding="utf-8")
-        assert written == reference.yaml_text(name), f"run {reference.COMMAND}"
+        assert written == reference.yaml_text(name), "run python docs_build/parameter_reference.py"
 
 
 @pytest.mark.parametrize("kind", KINDS.values())

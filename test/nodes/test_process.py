@@ -82,7 +82,7 @@ def test_of_a_node_that_cannot_be_made_nothing_is_left():
             self.destroyed.append(self.name)
 
     with pytest.raises(ValueError, match="depth_min < depth_max"):
-        process.made(Half, "recover_node")
+        process.make(Half, "recover_node")
     assert Half.destroyed == ["recover_node"]
 
 

@@ -104,10 +104,10 @@ def test_the_readme_runs_as_it_stands(repository: Path, tmp_path: Path) -> None:
     assert (tmp_path / "table.glb").read_bytes()[:4] == b"glTF"
 
 
-def test_the_reader_of_the_readme_runs(repository: Path) -> None:
+def test_the_reader_of_the_outputs_page_runs(repository: Path) -> None:
     """Up to its spinning, which never ends."""
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
-    script = snippets(repository / "README.md")[1]
+    script = snippets(repository / "docs" / "outputs.md")[0]
     code = f"import rclpy; rclpy.spin = lambda node: print(node.get_name())\n{script}\nprint(read.__name__)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True)
     assert done.stdout.split() == ["reader", "read"]

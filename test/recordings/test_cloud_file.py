@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import cKDTree
 
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings import cloud_file
 from sq_perception.recordings.cloud_file import UNORGANISED
+from sq_perception.recordings.cloud_frame import CloudFrame, moved
 from sq_perception.recordings.frame_file import FrameError, Reading, read
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation import support_plane
@@ -131,6 +134,105 @@ def test_points_far_off_the_axis_take_no_pixels_from_others(tmp_path):
         read(tmp_path / "c.ply")
 
 
+def table_cloud(rng):
+    """Shuffled points of a box (1) and a can (2) on a table (0) before the camera, and the labels of all."""
+    depth, _ = raycast.render(BODY, CAMERA)
+    other = Superquadric([0.03, 0.03, 0.05], [0.2, 1.0], [0.14, 0.05, 0.75], [0.5, 0.5, 0.5, 0.5])
+    beside, _ = raycast.render(other, CAMERA)
+    labels = np.where(np.isfinite(depth), 1, np.where(np.isfinite(beside), 2, 0))
+    depth = np.where(np.isfinite(depth), depth, np.where(np.isfinite(beside), beside, 0.9))
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    order = rng.permutation(depth.size)
+    return CAMERA.unproject(u, v, depth).reshape(-1, 3)[order], labels.ravel()[order]
+
+
+def write_labelled(path, points, labels, field="label"):
+    """A PCD, PLY or NPZ with labels, of the types that their usual writers give them."""
+    if path.suffix == ".npz":
+        np.savez(path, points=points, labels=labels)
+        return path
+    rows = np.zeros(len(points), [(axis, "<f4") for axis in "xyz"] + [(field, "<i4")])
+    for k, axis in enumerate("xyz"):
+        rows[axis] = points[:, k]
+    rows[field] = labels
+    if path.suffix == ".ply":
+        properties = "\n".join(f"property float {axis}" for axis in "xyz") + f"\nproperty int {field}"
+        head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}\nend_header\n"
+    else:
+        head = f"FIELDS x y z {field}\nSIZE 4 4 4 4\nTYPE F F F U\nWIDTH {len(rows)}\nHEIGHT 1\nDATA binary\n"
+    path.write_bytes(head.encode() + rows.tobytes())
+    return path
+
+
+@pytest.mark.parametrize(("name", "field"), [("a.pcd", "label"), ("a.ply", "instance"), ("a.npz", "")])
+def test_labels_of_points_are_the_masks_of_the_image(tmp_path, rng, name, field):
+    points, labels = table_cloud(rng)
+    frame = read(write_labelled(tmp_path / name, points, labels, field))
+    assert cloud_file.LABELLED in frame.notes
+    there = np.isfinite(frame.depth)
+    assert set(np.unique(frame.labels)) == {0, 1, 2}
+    assert not frame.labels[~there].any()
+    rows, columns = np.nonzero(there)
+    seen = frame.camera.unproject(columns, rows, frame.depth[there])
+    nearest = cKDTree(points).query(seen)[1]
+    assert np.mean(labels[nearest] == frame.labels[there]) > 0.98, "all but those along edges"
+    (box, can) = Recoverer(method="symmetry").recover(frame.depth, frame.camera, frame.labels).bodies
+    assert {box.label, can.label} == {1, 2}
+    assert read(tmp_path / name, reading=Reading(ignore_masks=True)).labels is None
+
+
+def test_labels_of_an_organised_cloud_keep_their_pixels_and_odd_ones_are_refused(tmp_path):
+    depth, cloud = points()
+    labels = np.where(depth < 1.0, 3.0, -1.0)
+    labels[20, :5] = np.nan
+    np.savez(tmp_path / "a.npz", points=cloud, labels=labels)
+    np.testing.assert_array_equal(read(tmp_path / "a.npz").labels, np.where(depth < 1.0, 3, 0))
+    for wrong, said in ((labels + 0.5, "whole numbers"), (labels[:-1], r"labels: expected numbers \(120, 160\)")):
+        np.savez(tmp_path / "a.npz", points=cloud, labels=wrong)
+        with pytest.raises(FrameError, match=said):
+            read(tmp_path / "a.npz")
+    np.savez(tmp_path / "a.npz", points=cloud[..., :2])
+    with pytest.raises(FrameError, match=r"points: expected \(n, 3\)"):
+        read(tmp_path / "a.npz")
+
+
+def test_a_cloud_in_another_frame_is_seen_from_its_camera(tmp_path):
+    """By the camera's pose an organised cloud is the same image; by its place alone the same points are seen."""
+    depth, cloud = points()
+    cloud[0, 0] = 0.0  # nothing measured, in any frame
+    turn, place = quaternions.normalize(np.array([0.6, -0.5, 0.4, -0.5])), np.array([0.3, -0.4, 1.2])
+    there = moved(cloud, quaternions.to_matrix(turn), place)
+    there[0, 0] = 0.0
+    np.savez(tmp_path / "a.npz", points=there)
+    pose = ",".join(str(number) for number in (*place, *turn))
+    frame = read(tmp_path / "a.npz", reading=Reading(frame=CloudFrame.parse(pose)))
+    np.testing.assert_allclose(frame.depth, np.where(depth > 0, depth, np.nan), rtol=1e-5)
+    assert "camera at 0.3 -0.4 1.2, turned" in frame.notes
+    looking = read(tmp_path / "a.npz", reading=Reading(frame=CloudFrame.parse("0.3,-0.4,1.2")))
+    rows, columns = np.nonzero(np.isfinite(looking.depth))
+    distances = np.linalg.norm(looking.camera.unproject(columns, rows, looking.depth[rows, columns]), axis=1)
+    assert np.median(distances) == pytest.approx(np.nanmedian(np.linalg.norm(cloud, axis=2)), rel=0.02)
+
+
+@pytest.mark.parametrize(("name", "point"), [("link", [1.0, -0.2, -0.1]), ("graphics", [0.2, -0.1, -1.0])])
+def test_axes_around_the_camera_have_names(name, point):
+    """A point a metre before the camera, 0.2 m to its right and 0.1 m below."""
+    seen, _ = CloudFrame.parse(name).optical(np.array([point]))
+    np.testing.assert_allclose(seen, [[0.2, 0.1, 1.0]], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["", "up", "1,2", "1,2,3,4", "1,2,nan", "0,0,0,0,0,0,0"])
+def test_what_is_no_place_of_a_camera_is_refused(text):
+    with pytest.raises(ValueError, match="expected where the camera stood"):
+        CloudFrame.parse(text)
+
+
+def test_a_camera_may_look_straight_down(rng):
+    flat = np.concatenate([rng.uniform(-0.2, 0.2, (500, 2)), np.zeros((500, 1))], axis=1) + 1e-9
+    seen, _ = CloudFrame.parse("0,0,1").optical(flat)
+    np.testing.assert_allclose(seen[:, 2], 1.0, atol=0.02)
+
+
 def test_no_free_space_means_that_what_is_beside_says_nothing(monkeypatch):
     """The same body before a near wall and a far one: without free space both give the same fit."""
     depth, index = raycast.render(BODY, CAMERA)
@@ -176,7 +278,7 @@ def test_a_cloud_in_the_frame_of_a_table_or_robot_is_refused_with_what_is_not_se
     table = np.concatenate([rng.uniform(-0.5, 0.5, (4000, 2)), 0.002 * rng.standard_normal((4000, 1))], axis=1)
     box = rng.uniform([-0.05, -0.03, 0.0], [0.05, 0.03, 0.16], (800, 3))
     trimesh.PointCloud(np.concatenate([table, box]) - origin).export(tmp_path / "a.ply")
-    with pytest.raises(FrameError, match=r"of 4800 points \d+% are behind it and \d+% more than 60 .*z up"):
+    with pytest.raises(FrameError, match=r"of 4800 points \d+% are behind it and \d+% more than 60 .* needs --frame"):
         read(tmp_path / "a.ply")
 
 

@@ -8,6 +8,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.bag_file import InputOptions
@@ -207,6 +208,25 @@ def test_masks_are_found_by_name(tmp_path):
     cv2.imwrite(str(folder / "a.png"), labels[:-1])
     with pytest.raises(FrameError, match="shape"):
         read(path, NUMBERS, reading=reading)
+
+
+def test_masks_are_the_indices_of_a_palette_and_binary_images_of_bop(tmp_path):
+    labels = np.zeros((48, 64), np.uint8)
+    labels[10:20, 10:20], labels[30:40, 10:20] = 1, 2
+    path = save(tmp_path / "000003.png")
+    palette, separate = tmp_path / "palette", tmp_path / "mask_visib"
+    palette.mkdir(), separate.mkdir()
+    image = Image.fromarray(labels)
+    image.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0])
+    image.save(palette / "000003.png")
+    for number in (1, 2):
+        cv2.imwrite(str(separate / f"000003_00000{number - 1}.png"), 255 * (labels == number).astype(np.uint8))
+    cv2.imwrite(str(separate / "000013_000000.png"), np.full((48, 64), 255, np.uint8))
+    for folder in (palette, separate):
+        np.testing.assert_array_equal(read(path, NUMBERS, reading=Reading(masks=folder)).labels, labels)
+    cv2.imwrite(str(separate / "000003_000002.png"), labels[1:])
+    with pytest.raises(FrameError, match="one size"):
+        read(path, NUMBERS, reading=Reading(masks=separate))
 
 
 def test_an_image_finds_the_camera_beside_it(tmp_path):

@@ -28,7 +28,7 @@ def array(found: publication.Identified):
 
 def test_a_message_of_a_body_that_tapers_encloses_it_without_the_taper_and_is_it_with(rng):
     tapered = Superquadric(BODY.size, BODY.shape, BODY.translation, BODY.rotation, [0.4, -0.2])
-    shown = array(publication.identified(recovery(Status.CONVERGED, body=tapered)))
+    shown = array(publication.identify(recovery(Status.CONVERGED, body=tapered)))
     read = Superquadric(shown.size, shown.shape, shown.translation, shown.rotation)
     surface = tapered.sample_surface(500, rng)
     assert (read[0].gauge(surface) < 1 + 1e-6).all()
@@ -37,12 +37,12 @@ def test_a_message_of_a_body_that_tapers_encloses_it_without_the_taper_and_is_it
 
 def test_a_weak_body_names_the_axis_that_is_open():
     """0.02 of 0.04 m along y; a body that converged or failed gives no reason."""
-    (reason,) = array(publication.identified(recovery(Status.WEAK))).reason
+    (reason,) = array(publication.identify(recovery(Status.WEAK))).reason
     assert Reason(int(reason)) == Reason.OPEN_Y
-    (reason,) = array(publication.identified(recovery(Status.WEAK, as_hull=True))).reason
+    (reason,) = array(publication.identify(recovery(Status.WEAK, as_hull=True))).reason
     assert Reason(int(reason)) == Reason.OPEN_Y | Reason.HULL
     for status in (Status.CONVERGED, Status.FAILED):
-        assert array(publication.identified(recovery(status))).reason == [0]
+        assert array(publication.identify(recovery(status))).reason == [0]
 
 
 def test_the_axis_is_named_as_the_published_body_names_it():
@@ -50,17 +50,17 @@ def test_the_axis_is_named_as_the_published_body_names_it():
     forms = BODY.equivalent_forms()
     exchanged = next(form for form in forms if form.size[0] == BODY.size[1])
     track = Followed(3, 9, True, exchanged, np.diag(np.square(SIGMA)) / 100)
-    shown = array(publication.identified(recovery(Status.WEAK), [track]))
+    shown = array(publication.identify(recovery(Status.WEAK), [track]))
     assert (shown.status, shown.reason) == ([WEAK], [Reason.OPEN_X])
     np.testing.assert_allclose(shown.sigma_size[0], SIGMA[:3] / 10, rtol=1e-6)
-    failed = array(publication.identified(recovery(Status.FAILED), []))
+    failed = array(publication.identify(recovery(Status.FAILED), []))
     assert (failed.status, failed.reason) == ([FAILED], [0])
 
 
 def test_deviations_are_along_and_about_the_axes_of_the_body():
     """x of the body is y of the camera: what is unsure along y of the camera is so along x of the body."""
     turned = Superquadric(BODY.size, BODY.shape, BODY.translation, [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
-    found = publication.identified(recovery(Status.CONVERGED, body=turned))
+    found = publication.identify(recovery(Status.CONVERGED, body=turned))
     shown = array(found)
     np.testing.assert_allclose(shown.sigma_shape, [[0.03, 0.05]], rtol=1e-6)
     np.testing.assert_allclose(shown.sigma_centre, [[0.002, 0.001, 0.003]], rtol=1e-6)
@@ -71,7 +71,7 @@ def test_deviations_are_along_and_about_the_axes_of_the_body():
 
 
 def test_what_a_method_does_not_know_is_not_claimed():
-    shown = array(publication.identified(recovery(Status.CONVERGED, np.full(11, np.nan))))
+    shown = array(publication.identify(recovery(Status.CONVERGED, np.full(11, np.nan))))
     for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
         assert np.isnan(getattr(shown, column)).all(), column
 

@@ -484,7 +484,7 @@ def test_bombs_do_not_unpack():
     import lz4.frame
 
     zeros = bytes(2**26)
-    for unpack, pack in ((bag_reader._unpacked, zstd.compress), (bag_reader._unpacked_lz4, lz4.frame.compress)):
+    for unpack, pack in ((bag_reader._unpack, zstd.compress), (bag_reader._unpack_lz4, lz4.frame.compress)):
         bomb = pack(zeros)
         assert unpack(bomb, 2**26) == zeros
         tracemalloc.start()

@@ -13,7 +13,7 @@ import yaml
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.recordings import scene_export
-from sq_perception.recordings.scene_export import SUFFIXES, Solid, grown, solids, write
+from sq_perception.recordings.scene_export import SUFFIXES, Solid, inflate, solids, write
 
 NAMES = ["box", "can", "ball", "egg", "odd"]
 """Best enclosed by a box, a cylinder, a sphere and a capsule, and a body that is none of them."""
@@ -173,14 +173,14 @@ def test_a_body_grows_by_the_errors_of_its_faces() -> None:
     body = Superquadric(np.full((1, 3), 0.05), np.full((1, 2), 0.2), np.zeros((1, 3)), quarter[None])
     covariance = np.zeros((1, 11, 11))
     covariance[0, 0, 0], covariance[0, 6, 6] = 0.003**2, 0.004**2
-    np.testing.assert_allclose(grown(body, covariance, 2.0).size, [[0.06, 0.05, 0.05]], atol=1e-9)
+    np.testing.assert_allclose(inflate(body, covariance, 2.0).size, [[0.06, 0.05, 0.05]], atol=1e-9)
     covariance[0, 0, 6] = covariance[0, 6, 0] = -0.003 * 0.004
-    np.testing.assert_allclose(grown(body, covariance, 1.0).size, [[0.057, 0.05, 0.05]], atol=1e-9)
-    assert grown(body, covariance, 0.0) is body
+    np.testing.assert_allclose(inflate(body, covariance, 1.0).size, [[0.057, 0.05, 0.05]], atol=1e-9)
+    assert inflate(body, covariance, 0.0) is body
     with pytest.raises(ValueError, match="covariances: expected finite ones"):
-        grown(body, np.full((1, 11, 11), np.nan), 1.0)
+        inflate(body, np.full((1, 11, 11), np.nan), 1.0)
     with pytest.raises(ValueError, match="sigmas"):
-        grown(body, covariance, -1.0)
+        inflate(body, covariance, -1.0)
 
 
 def test_what_is_no_format_and_no_name_is_refused(tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def with_bodies(last, bodies):
 
 
 def repeated(recoverer, last, depth, options=None, camera=CAMERA):
-    return still_scene.repeated(last, recoverer.read(depth, camera, None, options))
+    return still_scene.repeat(last, recoverer.read(depth, camera, None, options))
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -42,7 +41,7 @@ def _frames(count: int) -> list[tuple[int, Work]]:
 def test_two_processes_answer_as_one_and_in_order() -> None:
     frames = _frames(7)
     alone = Recoverer(method="symmetry", threads=1)
-    answers = list(workers.recovered([*frames[:3], (-1, None), *frames[3:]], workers.Processes(_SETUP, 2)))
+    answers = list(workers.recover_all([*frames[:3], (-1, None), *frames[3:]], workers.Processes(_SETUP, 2)))
     assert [key for key, _ in answers] == [0, 1, 2, -1, 3, 4, 5, 6]
     assert answers[3][1] is None
     for (_, work), (_, answer) in zip(frames, [one for one in answers if one[1] is not None], strict=True):
@@ -57,7 +56,7 @@ def test_two_processes_answer_as_one_and_in_order() -> None:
 @pytest.mark.parametrize("seconds", [0.0, 0.1, 0.3])
 def test_a_ctrl_c_while_a_process_begins_is_not_for_it(seconds: float) -> None:
     """Its imports take longer than that; what they were interrupted in was printed."""
-    process, pipe = workers._started(_SETUP)
+    process, pipe = workers._start(_SETUP)
     time.sleep(seconds)
     os.kill(process.pid, signal.SIGINT)
     pipe.close()
@@ -68,14 +67,14 @@ def test_a_ctrl_c_while_a_process_begins_is_not_for_it(seconds: float) -> None:
 def test_what_a_frame_raises_is_its_answer() -> None:
     (_, work), *_ = _frames(1)
     wrong = Work(work.depth[:10], work.camera, None, work.options)
-    (_, error), (_, answer) = workers.recovered([(0, wrong), (1, work)], workers.Processes(_SETUP, 2))
+    (_, error), (_, answer) = workers.recover_all([(0, wrong), (1, work)], workers.Processes(_SETUP, 2))
     assert isinstance(error, ValueError)
     assert len(answer.bodies) == 1
 
 
 def test_a_killed_process_costs_no_frame_and_answers_none_twice() -> None:
     frames, seen = _frames(24), []
-    for key, answer in workers.recovered(frames, workers.Processes(_SETUP, 2)):
+    for key, answer in workers.recover_all(frames, workers.Processes(_SETUP, 2)):
         seen.append(key)
         assert len(answer.bodies) == 1
         if key == 5:
@@ -91,7 +90,7 @@ def _dies_while_it_answers(_: Setup, pipe: Connection) -> None:
 
 def test_processes_that_die_while_they_answer_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_serve", _dies_while_it_answers)
-    answers = list(workers.recovered(_frames(2), workers.Processes(_SETUP, 2)))
+    answers = list(workers.recover_all(_frames(2), workers.Processes(_SETUP, 2)))
     assert [key for key, _ in answers] == [0, 1]
     assert all(isinstance(answer, workers.WorkerLostError) for _, answer in answers)
 
@@ -107,7 +106,7 @@ def test_a_frame_at_which_processes_die_takes_no_other_with_it(monkeypatch: pyte
                 os.kill(process, signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
-    answers = workers.recovered(frames, workers.Processes(_SETUP, 1))
+    answers = workers.recover_all(frames, workers.Processes(_SETUP, 1))
     found = [next(answers), next(answers)]
     killer.start()
     found.append(next(answers))
@@ -118,40 +117,6 @@ def test_a_frame_at_which_processes_die_takes_no_other_with_it(monkeypatch: pyte
     lost = [key for key, answer in found if isinstance(answer, workers.WorkerLostError)]
     assert lost in ([], [2])  # it may have been answered before the first kill
     assert all(len(answer.bodies) == 1 for key, answer in found if key not in lost)
-
-
-def test_a_worker_of_a_cluster_that_is_killed_costs_no_frame_and_answers_none_twice() -> None:
-    distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    frames = _frames(12)
-    alone = Recoverer(method="symmetry", threads=1)
-    with distributed.LocalCluster(2, threads_per_worker=2, dashboard_address=None, host="127.0.0.1") as cluster:
-        answers, keys = [], []
-        crew = workers.Cluster(_SETUP, cluster.scheduler_address)
-        for key, answer in workers.recovered([*frames[:3], (-1, None), *frames[3:]], crew):
-            keys.append(key)
-            answers += [] if key == -1 else [answer]
-            if key == 2:
-                os.kill(cluster.workers[0].pid, signal.SIGKILL)
-    assert keys == [0, 1, 2, -1, *range(3, 12)]
-    for (_, work), answer in zip(frames, answers, strict=True):
-        expected = alone.recover(work.depth, work.camera, work.labels, work.options)
-        mine, theirs = answer.bodies[0].superquadric, expected.bodies[0].superquadric
-        np.testing.assert_allclose(mine.to_flat(), theirs.to_flat(), rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("address", ["localhost", "http://localhost:8787", "localhost:eight"])
-def test_what_is_no_address_of_a_cluster_leaves_nothing_behind_that_would_hang(address: str) -> None:
-    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    before = threading.enumerate()
-    with pytest.raises(ValueError, match=r"port|scheme|invalid literal"):
-        workers.Cluster(_SETUP, address)
-    assert threading.enumerate() == before
-
-
-def test_without_its_extra_a_cluster_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ImportError, match=r"'distributed': pip install 'sq_perception\[cluster\]'"):
-        workers.Cluster(_SETUP, "tcp://127.0.0.1:8786")
 
 
 def _children() -> list[int]:

@@ -8,7 +8,7 @@ import pytest
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.geometry.union import flat_support, moved, support_of_union
+from sq_perception.geometry.union import flat_support, move, support_of_union
 from sq_perception.simulation.household import KINDS, draw_thing
 
 MEASURES = {
@@ -49,7 +49,7 @@ def test_the_compiled_support_function_is_the_closed_form() -> None:
     np.testing.assert_allclose(support_of_union(parts, DIRECTIONS), closed, atol=1e-9)
     turn, shift = quaternions.random(1, rng)[0], rng.normal(size=3)
     np.testing.assert_allclose(
-        moved(parts.to_flat(), turn, shift), parts.transformed(turn, shift).to_flat(), atol=1e-12
+        move(parts.to_flat(), turn, shift), parts.transformed(turn, shift).to_flat(), atol=1e-12
     )
 
 
@@ -96,7 +96,7 @@ def test_a_lying_thing_is_as_high_as_it_is_deep() -> None:
         thing = draw_thing(rng, ["can"])
         edges = thing.box[1] - thing.box[0]
         for rest in thing.rests:
-            flat = moved(thing.parts.to_flat(), rest.turn, np.zeros(3))
+            flat = move(thing.parts.to_flat(), rest.turn, np.zeros(3))
             height = flat_support(flat, np.array([[0.0, 0, 1], [0, 0, -1]])).sum()
             assert height == pytest.approx(edges[1] if rest.name == "lying" else edges[2], abs=1e-9)
 

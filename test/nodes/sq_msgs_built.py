@@ -1,0 +1,135 @@
+"""What nodes and their peers do with sq_msgs; run by test_sq_msgs.py, in an environment where it is built."""
+
+from __future__ import annotations
+
+import numpy as np
+from rclpy.action import ActionClient
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+from spun_nodes import SpunNodes
+from std_msgs.msg import Header
+
+from sq_msgs.action import Recover as RecoverImages
+from sq_msgs.msg import GraspArray, Superquadric, SuperquadricArray
+from sq_msgs.srv import PlanGrasps, Recover
+from sq_msgs_py import superquadrics
+from sq_msgs_py.interfaces import superquadric_array
+from sq_perception.nodes.grasp_node import GraspNode
+
+
+def bodies(count: int = 2) -> superquadrics.SuperquadricArray:
+    rng = np.random.default_rng(3)
+    rotation = rng.normal(size=(count, 4))
+    return superquadrics.SuperquadricArray(
+        size=rng.uniform(0.02, 0.05, (count, 3)),
+        shape=rng.uniform(0.1, 1.0, (count, 2)),
+        translation=rng.uniform(0.4, 0.6, (count, 3)),
+        rotation=rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
+        score=rng.random(count),
+        residual=rng.random(count),
+        sigma_size=rng.random((count, 3)),
+        id=np.arange(count) + 7,
+        status=np.arange(count) % 3,
+        reason=np.full(count, 5),
+        fused=np.arange(count) % 2,
+        taper=rng.uniform(-0.5, 0.5, (count, 2)),
+        objectness=rng.random(count),
+    )
+
+
+def same(found: Superquadric, array: superquadrics.SuperquadricArray, k: int) -> None:
+    place, turn, size = found.pose.pose.position, found.pose.pose.orientation, found.half_size
+    np.testing.assert_array_equal([place.x, place.y, place.z], array.translation[k])
+    np.testing.assert_array_equal([turn.x, turn.y, turn.z, turn.w], array.rotation[k])
+    np.testing.assert_array_equal([size.x, size.y, size.z], array.size[k])
+    np.testing.assert_array_equal(found.exponents, array.shape[k])
+    np.testing.assert_array_equal(found.taper, array.taper[k])
+    for name in ("id", "label", "status", "reason", "seen", "fused", "score", "residual", "objectness"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(array, name)[k], name)
+
+
+def test_a_message_holds_every_number_of_the_cloud_the_covariances_and_parts():
+    array, header = bodies(), Header(frame_id="camera")
+    covariances = np.random.default_rng(4).random((2, 6, 6))
+    sent = superquadric_array(array, covariances, header, parts=array.where(array.id == 8))
+    message = deserialize_message(serialize_message(sent), SuperquadricArray)
+    for k in range(2):
+        same(message.superquadrics[k], array, k)
+        np.testing.assert_array_equal(message.superquadrics[k].pose.covariance, covariances[k].ravel())
+        assert np.isnan(message.superquadrics[k].sigma_exponents).all(), "not known"
+    (part,) = message.parts
+    same(part, array, 1)
+    assert np.isnan(part.pose.covariance).all()
+    names = {name: value for name, value in vars(superquadrics).items() if name in ("CONVERGED", "WEAK", "FAILED")}
+    names |= {one.name: int(one) for one in superquadrics.Reason}
+    assert {name: getattr(Superquadric, name) for name in names} == names, "the constants are those of the cloud"
+
+
+def test_recover_node_publishes_and_answers_in_it(make_bench):
+    bench = make_bench()
+    heard = bench.hear(SuperquadricArray, "recover_node/superquadric_array", 10)
+    bench.until(lambda: bench.node._outputs.array.get_subscription_count())
+    bench.send_info()
+    cloud, array = bench.answer(bench.depth())
+    bench.until(lambda: heard)
+    assert heard[0].header == cloud.header
+    same(heard[0].superquadrics[0], array, 0)
+    assert heard[0].superquadrics[0].status == Superquadric.CONVERGED
+
+    client = bench.peer.create_client(Recover, "recover_node/recover_array")
+    assert client.wait_for_service(30.0)
+    asked = client.call_async(Recover.Request())
+    bench.until(lambda: bench.node._triggers)
+    bench.send(bench.depth())
+    bench.until(asked.done)
+    assert asked.result().success, asked.result().message
+    assert len(asked.result().bodies.superquadrics) == 1
+
+    images, seen = ActionClient(bench.peer, RecoverImages, "recover_node/recover_images"), []
+    assert images.wait_for_server(30.0)
+    goal = images.send_goal_async(RecoverImages.Goal(images=2), lambda message: seen.append(message.feedback.bodies))
+    bench.until(goal.done)
+    ended = goal.result().get_result_async()
+    for count in (1, 2):
+        bench.until(lambda: bench.node._triggers)
+        bench.send(bench.depth())
+        bench.until(lambda count=count: len(seen) == count)
+    bench.until(ended.done)
+    assert ended.result().result.success
+    assert repr(ended.result().result.bodies) == repr(seen[-1]), "the same, NaN of what is not known included"
+    images.destroy()
+
+
+def test_grasp_node_publishes_and_answers_in_it():
+    bench = SpunNodes()
+    node = GraspNode("grasp_node", context=bench.context)
+    try:
+        clouds = bench.peer.create_publisher(PointCloud2, "superquadrics", 10)
+        heard = bench.hear(GraspArray, "grasp_node/grasp_array", 10)
+        bench.spin([node])
+        bench.until(lambda: node.is_active and clouds.get_subscription_count())
+        upright = superquadrics.SuperquadricArray(
+            **{
+                **{name: getattr(bodies(1), name) for name in ("score", "residual", "id", "status", "objectness")},
+                "size": [[0.02, 0.02, 0.05]],
+                "shape": [[0.2, 1.0]],
+                "translation": [[0.0, 0.0, 0.5]],
+                "rotation": [[0.7071068, 0.0, 0.0, 0.7071068]],
+                "sigma_size": [[0.001, 0.001, 0.001]],
+            }
+        )
+        clouds.publish(superquadrics.to_message(upright, Header(frame_id="camera")))
+        bench.until(lambda: heard)
+        assert heard[0].grasps, "a can that a hand can hold"
+        best = heard[0].grasps[0]
+        assert best.id == 7
+        assert 0.03 < best.width < best.opening
+        client = bench.peer.create_client(PlanGrasps, "grasp_node/plan_array")
+        assert client.wait_for_service(30.0)
+        asked = client.call_async(PlanGrasps.Request())
+        bench.until(asked.done)
+        assert asked.result().success, asked.result().message
+        assert asked.result().grasps.grasps == heard[0].grasps
+    finally:
+        bench.until(node.close)
+        bench.close()

@@ -1,0 +1,18 @@
+# The message packages of PyPI name the include folders of the machine that built them: leave out those that are not
+# here, once all packages are found.
+function(leave_out_missing_folders)
+  get_property(targets DIRECTORY PROPERTY IMPORTED_TARGETS)
+  foreach(target ${targets})
+    get_target_property(folders ${target} INTERFACE_INCLUDE_DIRECTORIES)
+    if(folders)
+      set(there)
+      foreach(folder ${folders})
+        if(EXISTS "${folder}" OR folder MATCHES "^\\$<")
+          list(APPEND there "${folder}")
+        endif()
+      endforeach()
+      set_target_properties(${target} PROPERTIES INTERFACE_INCLUDE_DIRECTORIES "${there}")
+    endif()
+  endforeach()
+endfunction()
+cmake_language(DEFER CALL leave_out_missing_folders)
