@@ -15,9 +15,9 @@ once a rule, by the geometry and the network of masks as ``Recoverer.recover`` d
 
 A row gives what the rule gains: the figure with it less the figure without it, in per cent of the things, or segments
 in 100 scenes; with the standard error of the sum of the scenes' differences.  A rule that gains less than two standard
-errors has no place in the package.  results/segmentation_rules_before.md has those that were there before, of which
-eight are gone.  ``--each`` names a file of JSON lines, one a scene, that a run adds to: a run that
-was stopped goes on, and one of more scenes or other seeds counts them together.
+errors has no place in the package.  results/segmentation_rules_before.md has those that were there before.  ``--each``
+names a file of JSON lines, one a scene, that a run adds to: a run that was stopped goes on, and one of more scenes or
+other seeds counts them together.
 """
 
 from __future__ import annotations
@@ -55,27 +55,26 @@ FIGURES = ("found", "nothing", "pieces", "iou")
 _S = "sq_perception.segmentation"
 _OWN = "sq_perception.recovery.own_segments"
 RULES: dict[str, dict[str, Any]] = {
-    "walls around things (enclosures)": {f"{_S}.enclosures.walls": lambda *_: set()},
+    "plane: things are near above it (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
+    "plane: best of finalists alone (_FINALISTS)": {f"{_S}.support_plane._FINALISTS": 1},
+    "support: bent": {f"{_S}.support_surface._DISTORTION": 0.0},
+    "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
     "level tops (level_faces)": {f"{_S}.level_faces.found": lambda *_: []},
-    "ramps (risen)": {f"{_S}.support_surface.risen": lambda relative, *_: np.zeros(relative.shape, bool)},
-    "a bent support": {f"{_S}.support_surface._GAIN": np.inf},
-    "grazing sides (_jagged_share)": {f"{_S}.bodies._JAGGED": -1.0},
+    "walls of containers (container_walls)": {f"{_S}.container_walls.walls": lambda *_: set()},
+    "bodies: grazing sides (_GAP)": {f"{_S}.bodies._GAP": 0.0},
+    "bodies: feet (_FOOT_PIXELS)": {f"{_S}.bodies._FOOT_PIXELS": 0},
+    "pieces: of all": {f"{_S}.convex_pieces.pieces": lambda *_: []},
+    "pieces: as large near by (_NEAR)": {f"{_S}.sampled_image._NEAR": 1e-6},
+    "pieces: nearest first (_METRIC)": {f"{_S}.convex_pieces._METRIC": 0.0},
+    "pieces: a step of 5 mm (_LEAST_GAP)": {f"{_S}.sampled_image._LEAST_GAP": 0.0},
     "vessels: insides and walls": {f"{_S}.convex_parts._insides": lambda *_: []},
     "vessels: pieces (_with_whole_vessels)": {f"{_S}.convex_pieces._with_whole_vessels": lambda group, *_: group},
     "behind something nearer (_go_on)": {f"{_S}.convex_parts._go_on": lambda i, n, t, wanted: np.zeros_like(wanted)},
-    "strays of pieces (_gathered)": {f"{_S}.convex_pieces._gathered": lambda group, *_: group},
     "bits (_BIT_AS_ONE)": {f"{_S}.convex_parts._BIT_AS_ONE": 0.3},
-    "table above a floor (_STOREY)": {f"{_S}.support_plane._STOREY": np.inf},
-    "near above the plane (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
-    "small table before a wall (_LEAST_BEFORE_WALL)": {f"{_S}.support_plane._LEAST_BEFORE_WALL": 0.1},
     "network: a probability that it is a thing (LEAST)": {f"{_S}.objectness.LEAST": 0.0},
-    "network: that probability without heights": {f"{_S}.objectness._MOST_SURE": 0.1},
-    "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
-    "network: pieces of what is too large (claims)": {f"{_OWN}._claimed": lambda *_: ()},
     "network: parts": {f"{_OWN}.SegmentNetwork._parted": lambda *_: []},
-    "network: parts behind something": {f"{_OWN}.SegmentNetwork._one_behind": lambda self, labels, parts, s: parts},
+    "network: a part claims itself (_ITSELF)": {f"{_OWN}._ITSELF": 0.0},
     "network: joins": {f"{_OWN}._ONE": 1.0},
-    "network: what is left": {f"{_OWN}.SegmentNetwork._left": lambda *_: []},
     "network: all of it": {f"{_OWN}.SegmentNetwork.improved": lambda self, found: found},
 }
 """What is put in the place of each rule; a rule that is gone from the package is gone from here."""

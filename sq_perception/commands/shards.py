@@ -77,7 +77,7 @@ def train_things(arguments: Sequence[str]) -> int:
 def train_masks(arguments: Sequence[str]) -> int:
     """Run ``sq-perception train-masks``; return the exit code."""
     text = _TRAIN.format(
-        what="finds foreign readings in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
+        what="finds outliers in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
     )
     example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
     options = vars(_training("masks", text, example, MASK_RUN).parse_args(arguments))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging import perforation
+from sq_perception.imaging import hole_filling
 from sq_perception.imaging.camera import Camera, Lens
 
 _BEHIND = 0.015
@@ -91,7 +91,7 @@ class Surroundings:
         _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
         if len(kept) > _MOST:
             kept = kept[np.linspace(0, len(kept) - 1, _MOST).astype(int)]
-        return cls(plane, points[kept], perforation.fill(z)[0], camera)
+        return cls(plane, points[kept], hole_filling.filled(z)[0], camera)
 
     def down(self, places: np.ndarray) -> np.ndarray:
         """Return unit vectors (k, 3) downwards at places (k, 3): to the plane, or away from the frame's origin."""

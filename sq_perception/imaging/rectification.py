@@ -22,7 +22,7 @@ Neighbours show one surface if it would be seen at less than 84 degrees, a relat
 :mod:`sq_perception.imaging.inverse_depth`.  A smaller step may still be the edge of something flat; then a pixel is
 wrong by at most that step.  OpenCV before 5 looks up at 32nds of a pixel, and is off by up to five times as much
 between pixels, some hundredths of a millimetre.  Single pixels without depth inside a surface, and the gaps of a
-perforated image (:mod:`sq_perception.imaging.perforation`), are no edge: they are bridged for their neighbours' sake,
+perforated image (:mod:`sq_perception.imaging.hole_filling`), are no edge: they are bridged for their neighbours' sake,
 and stay empty.  Labels are those of the nearest pixel.
 """
 
@@ -36,7 +36,7 @@ import cv2
 import numpy as np
 
 from sq_perception.files.unpacking import MOST_PIXELS
-from sq_perception.imaging import depth_steps, perforation
+from sq_perception.imaging import depth_steps, hole_filling
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 
@@ -164,7 +164,7 @@ class Lookup:
         nearest = self._nearest(image, np.nan)
         # Warnings for pixels without depth only.
         with np.errstate(divide="ignore", invalid="ignore"):
-            bridged, _, _ = perforation.fill(image)
+            bridged, _, _ = hole_filling.filled(image)
             inverse = cv2.patchNaNs(1 / bridged, 0)
             closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, depth_steps.CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)

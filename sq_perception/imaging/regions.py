@@ -9,8 +9,6 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
-_OPEN = 0.1
-"""Share of a region's border from which on it is not enclosed by others."""
 _BAND = 0.1
 """Share of a side of an image: the most of it that a band without readings takes along a border; beyond more there is
 nothing to measure.  That of a D435 takes so much of what is 0.25 m away.  Chosen."""
@@ -148,11 +146,6 @@ def borders(
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near, far)
     return met + met.T, beside + beside.T, behind
-
-
-def find_enclosed(met: np.ndarray) -> np.ndarray:
-    """Which labels (n,) are next to others nearly all around, hardly to 0, by their contacts."""
-    return np.asarray(met[:, 0] < _OPEN * met.sum(axis=1))
 
 
 @kernel

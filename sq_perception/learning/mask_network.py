@@ -1,6 +1,6 @@
 """The network that predicts which readings of a segment are of its object: segment and surroundings in, logits out.
 
-Segments found in depth alone hold strays: pixels that a sensor widened an edge by, and parts of neighbours.  A fit
+Segments found in depth alone hold outliers: pixels that a sensor widened an edge by, and parts of neighbours.  A fit
 takes them for surface.  For each cell of a view (:mod:`sq_perception.imaging.segment_view`) the network predicts
 
     l = log p / (1 - p),    p = P(the cell's reading is one of the object that most of the segment shows).

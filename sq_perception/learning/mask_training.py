@@ -36,21 +36,21 @@ def mask_loss(logits: torch.Tensor, images: torch.Tensor, truth: torch.Tensor) -
 
 @torch.inference_mode()
 def validate(network: MaskNetwork, views: SegmentViews) -> dict[str, float]:
-    """Shares in the objects' readings: strays in segments before and after, and readings that are lost."""
+    """Shares in the objects' readings: outliers in segments before and after, and readings that are lost."""
     network.eval()
     device = next(network.parameters()).device
-    strays = left = lost = objects = 0
+    outliers = left = lost = objects = 0
     for i in range(0, len(views.images), _BATCH):
         images = torch.from_numpy(views.images[i : i + _BATCH].astype(np.float32)).to(device).permute(0, 3, 1, 2)
         truth = torch.from_numpy(views.truth[i : i + _BATCH]).to(device)
         inside = (images[:, SEGMENT] > 0) & (truth != UNKNOWN)
         kept, own = network(images) >= 0, inside & (truth == YES)
         objects += int(own.sum())
-        strays += int((inside & ~own).sum())
+        outliers += int((inside & ~own).sum())
         left += int((inside & ~own & kept).sum())
         lost += int((own & ~kept).sum())
-    objects = max(objects, 1)  # views of no object at all have strays alone
-    return {"strays": strays / objects, "left": left / objects, "lost": lost / objects}
+    objects = max(objects, 1)  # views of no object at all have outliers alone
+    return {"outliers": outliers / objects, "left": left / objects, "lost": lost / objects}
 
 
 def _new_network(start: str) -> MaskNetwork:

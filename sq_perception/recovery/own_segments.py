@@ -1,4 +1,4 @@
-"""Segments of a depth image as a network sees them: which of them are one object, and which of their pixels are strays.
+"""Segments of a depth image as a network sees them: which of them are one object, and which pixels are outliers.
 
 Rules of geometry take an image apart (:mod:`sq_perception.segmentation.segments`); a network that saw thousands of such
 segments knows better what belongs together.  For a segment a it predicts p_a(x), the probability that the reading of a
@@ -8,18 +8,15 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
               below ``_SURE``, the network is asked about that piece as if it were a segment, and then about pieces
               that no object claims.  A piece shows another object if it claims itself, and if it and the objects
               found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the object
-              that claims it most.  Parts that go on behind something nearer, as lines of sight tell
-              (:mod:`sq_perception.segmentation.convex_parts`), stay one: the two ends of a box behind a post look like
-              two things
+              that claims it most
     joined    a and b are one if each is the other's object: if the smaller of the means of p_a over b and of p_b over a
-              is more than ``_ONE``; the surest pairs first, until there is none
-    strays    pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
+              is more than ``_ONE``; the surest pairs first, until there is none.  Not where both together are larger
+              than ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
+    outliers  pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
               label image, as they are no background either, but no fit takes them for the object's surface
     nothing   a is dropped if it is no thing (:mod:`sq_perception.segmentation.objectness`), by the median logit of p_a
               over it and by its rise: a bump of the table, a wall, the room behind; not where there is no support
               plane, as all that is seen may be the object
-    left      what is left by strays and by dropped segments, in pieces that are as large as an object, is asked about
-              once more: a piece is an object if it is a thing, and no other segment is of its object
 
 Without a support plane it parts nothing.  The network is asked once about a segment, and again about one that was
 parted or joined.
@@ -31,16 +28,16 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import canonical_view, depth_steps, regions, segment_view
+from sq_perception.imaging import canonical_view, regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.segmentation import convex_parts, objectness, pieces, segments
+from sq_perception.segmentation import objectness, pieces, segments
+from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.segments import Segmentation
 
@@ -60,15 +57,10 @@ _ITSELF = 0.5
 """A piece that claims less of itself shows no object: what a sensor smeared, or several things."""
 _LEAST_TO_PART = 60
 """Cells of a segment that may be parted: 15 in a piece."""
+_POINTS = 400
+"""Points of what may be joined, for its size."""
 _LEAST_CELLS = 4
 """Cells that another segment has in a view at least, for a mean over them."""
-_ROUNDS = 3
-"""Rounds of joining: eight pieces may become one."""
-_BRUSH = np.ones((7, 7), np.uint8)
-"""Pixels; what is left along edges is thinner.  With 3 x 3 212 of them are missed, and on 14 recorded frames a second
-look adds 6 bodies of nothing to the 30 that there are without; with this 1."""
-_ASKED = 0.85
-"""Share of a dropped segment from which on a piece of it is that segment once more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +98,8 @@ class SegmentNetwork:
         Support plane.
     mapped
         Applies a function of some labels to all of them; it may do so in several threads.
+    max_size
+        Largest edge of an object, metres.
     """
 
     network: CompactMasks
@@ -113,29 +107,25 @@ class SegmentNetwork:
     camera: Camera
     plane: np.ndarray | None
     mapped: _Mapped
+    max_size: float = LARGEST_THING
 
     def improved(self, found: Segmentation) -> Segmentation:
-        """Segments parted, joined, with their strays, without those of nothing; labels from 1, the largest first."""
+        """Segments parted, joined, with their outliers, without those of nothing; labels from 1, the largest first."""
         if not found.ids:
             return found
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
-        parts = [] if self.plane is None else self._parted(labels, seen, found.sigma)
+        parts = [] if self.plane is None else self._parted(labels, seen)
         if parts:
             seen |= self._seen(labels, parts)
-        for _ in range(_ROUNDS if len(seen) > 1 else 0):
-            joined = _join(labels, seen)
-            if not joined:
-                break
+        while len(seen) > 1 and (joined := self._joined(labels, seen)):
             seen |= self._seen(labels, joined)
         likely = self._things(labels, seen, found.heights)
-        strays = np.zeros(labels.shape, bool)
+        outliers = np.zeros(labels.shape, bool)
         for label in likely:
             window = seen[label].window
-            strays[window] |= _strays(labels[window] == label, _logits(seen[label]))
-        claims = _claimed(labels, {label: seen[label] for label in likely})
-        likely |= self._left(labels, list(likely), strays, found.heights)
-        found = replace(found, labels=labels, strays=strays, claims=claims)
+            outliers[window] |= _outliers(labels[window] == label, _logits(seen[label]))
+        found = replace(found, labels=labels, outliers=outliers)
         return segments.kept(found, likely)
 
     def _things(
@@ -151,55 +141,40 @@ class SegmentNetwork:
             likely[label] = objectness.probability(objectness.logit(z, median))
         return {label: each for label, each in likely.items() if each >= objectness.LEAST}
 
-    def _left(
-        self, labels: np.ndarray, kept: Sequence[int], strays: np.ndarray, heights: HeightEvidence | None
-    ) -> dict[int, float]:
-        """Label the things among what is of no object; changes ``labels`` and ``strays``, returns the new ones."""
-        asked, names = _unclaimed(labels, kept, strays)
-        seen = self._seen(asked, names) if names else {}
-        likely = {}
-        for label, each in self._things(asked, seen, heights).items():
-            answer = seen[label]
-            if np.delete(_claims(asked, answer), label).max() < _APART:
-                likely[label] = each
-                own = asked[answer.window] == label
-                labels[answer.window][own] = label
-                strays[answer.window] &= ~own
-                strays[answer.window] |= _strays(own, _logits(answer))
-        return likely
-
-    def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen], sigma: float) -> list[int]:
-        """Part segments that are several objects, in ``labels``; returns the labels of all the parts.
-
-        ``sigma`` is the noise of the depth at one metre.
-        """
+    def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
+        """Part segments that are several objects, in ``labels``; returns the labels of all the parts."""
         doubts = {label: doubt for label, answer in seen.items() if (doubt := _doubt(answer)) is not None}
         if not doubts:
             return []
         objects = self.mapped(lambda some: self._objects([doubts[label] for label in some]), list(doubts))
         parts: list[int] = []
         for label, each in zip(doubts, objects, strict=True):
-            parts += self._one_behind(labels, _cut(labels, label, seen[label], each), sigma)
+            parts += _cut(labels, label, seen[label], each)
         return parts
 
-    def _one_behind(self, labels: np.ndarray, parts: Sequence[int], sigma: float) -> list[int]:
-        """Join parts of a segment that go on behind something nearer, in ``labels``; returns the parts that are left.
+    def _joined(self, labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
+        """Join pairs that are each other's object, each segment with one other; the labels that remain of them."""
+        mutual, order = _mutual(labels, seen), list(seen)
+        remain: list[int] = []
+        taken: set[int] = set()
+        for pair in np.argsort(-mutual, axis=None):
+            i, j = divmod(int(pair), len(order))
+            if mutual[i, j] <= _ONE:
+                break
+            if not taken & {i, j} and self._may_be_one((labels == order[i]) | (labels == order[j])):
+                taken |= {i, j}
+                labels[labels == order[j]] = order[i]
+                del seen[order[j]]
+                remain.append(order[i])
+        return remain
 
-        Empty where the segment is whole again: the network has seen it.  Of 64 segments of 500 simulated scenes that it
-        would part 22 show one thing; this leaves 10 of them whole, and 1 of the 42 that show two.
-        """
-        if not parts:
-            return []
-        name = {part: part for part in parts}
-        depth = np.where(np.isfinite(self.depth), self.depth, np.float32(0))
-        for pair in convex_parts.continued(labels, parts, depth, self.camera, sigma):
-            first, second = sorted(name[part] for part in pair)  # the segment's own name is the least
-            name = {part: first if now == second else now for part, now in name.items()}
-        for part, now in name.items():
-            if now != part:
-                labels[labels == part] = now
-        remain = list(dict.fromkeys(name.values()))
-        return remain if len(remain) > 1 else []
+    def _may_be_one(self, mask: np.ndarray) -> bool:
+        """Whether what a mask (height, width) shows may be one object, or one piece of furniture, which is left out
+        whole: no object is between ``max_size`` and the largest thing."""
+        rows, columns = np.nonzero(mask)
+        points = regions.some_points(rows, columns, self.depth, self.camera, _POINTS)
+        edge = largest_edge(points, None if self.plane is None else self.plane[:3])
+        return edge <= self.max_size or edge > LARGEST_THING
 
     def _objects(self, doubts: Sequence[_Doubt]) -> list[list[np.ndarray]]:
         """For each segment, the logits (p, p), in the cells of its view, of each object that its pieces show.
@@ -308,64 +283,12 @@ def _claims(labels: np.ndarray, answer: _Seen) -> np.ndarray:
     return np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), 0)
 
 
-def _claimed(labels: np.ndarray, seen: Mapping[int, _Seen]) -> tuple[tuple[int, int], ...]:
-    """Pairs of labels a, b of which most of b is of the object that a shows."""
-    claims = {label: np.flatnonzero(_claims(labels, answer) > _ONE).tolist() for label, answer in seen.items()}
-    return tuple((one, other) for one, others in claims.items() for other in others if other != one)
-
-
-def _join(labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
-    """Join pairs that are each other's object, each segment with one other; the labels that remain of them."""
-    mutual, order = _mutual(labels, seen), list(seen)
-    remain: list[int] = []
-    taken: set[int] = set()
-    for pair in np.argsort(-mutual, axis=None):
-        i, j = divmod(int(pair), len(order))
-        if mutual[i, j] <= _ONE:
-            break
-        if not taken & {i, j}:
-            taken |= {i, j}
-            labels[labels == order[j]] = order[i]
-            del seen[order[j]]
-            remain.append(order[i])
-    return remain
-
-
-def _unclaimed(labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> tuple[np.ndarray, list[int]]:
-    """Labels (height, width) with a new one for each large piece that no object claims, and these new ones.
-
-    Pieces are of the strays and of the segments that are not kept.  One that is nearly all of such a segment gets none,
-    as the network has been asked about it.
-    """
-    nothing = np.ones(int(labels.max()) + 1, np.int32)
-    nothing[[0, *kept]] = 0
-    free = regions.renumber(labels, nothing).astype(np.uint8) | strays.view(np.uint8)
-    left, top, width, height = cv2.boundingRect(free)
-    reach = len(_BRUSH)
-    window = slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
-    parts = depth_steps.components(cv2.morphologyEx(free[window], cv2.MORPH_OPEN, _BRUSH))
-    sizes = regions.extents(parts)[:, 0]
-    large = np.flatnonzero(sizes >= segments.least_pixels(labels.size))
-    if not len(large):
-        return labels, []
-    counts = regions.extents(labels)[:, 0]
-    asked = labels.copy()
-    names: list[int] = []
-    for k in large:
-        part = parts == k
-        whose = int(np.bincount(labels[window][part]).argmax())
-        if not (nothing[whose] and sizes[k] > _ASKED * counts[whose]):
-            names.append(len(counts) + len(names))
-            asked[window][part] = names[-1]
-    return asked, names
-
-
 def _logits(answer: _Seen) -> np.ndarray:
     """The logits of p at the pixels of a segment's window."""
     return answer.view.at_pixels(answer.logits, answer.window)
 
 
-def _strays(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
+def _outliers(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
     """The pixels of a segment that are not its object's own.
 
     None where they are most of it, as the object is what most of the segment shows, or nearly all.

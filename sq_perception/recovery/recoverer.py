@@ -4,7 +4,7 @@
 
 :class:`~sq_perception.recovery.still_scene.StillScene` puts the reuse of a frame's answers for the next one around it.
 
-With ``auto``, own segments are parted, joined, dropped where they show no object, and rid of strays by a network
+With ``auto``, own segments are parted, joined, dropped where they show no object, and rid of outliers by a network
 (:mod:`sq_perception.recovery.own_segments`).
 
 | method | body |
@@ -38,7 +38,7 @@ from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_blas_thread, short_turns
-from sq_perception.imaging import depth_units, perforation, ranges, raycast
+from sq_perception.imaging import depth_units, hole_filling, ranges, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
@@ -187,7 +187,7 @@ class Recoverer:
         self.recover(image, camera, (index >= 0).astype(np.int32))
         self.recover(image, camera)
         image[::2] = np.nan
-        perforation.fill(image)
+        hole_filling.filled(image)
 
     def recover(
         self,
@@ -229,7 +229,7 @@ class Recoverer:
         began = time.perf_counter()
         measured = _measure(camera.readings(depth), camera)
         labels = None if labels is None else _masks(labels, measured)
-        measured, labels, closed = perforation.fill(measured, labels)
+        measured, labels, closed = hole_filling.filled(measured, labels)
         return Readings(measured, closed, camera, labels, options or self._options, began)
 
     def find_objects(self, readings: Readings, segmentation: segments.Segmentation | None = None) -> Found:
@@ -249,8 +249,8 @@ class Recoverer:
         with self._at_work():
             network = self._network_for(readings)
             config = None if network is None else network.config
-            strays = found.segmentation.strays
-            objects = found.objects if strays is None else [obj.without(strays) for obj in found.objects]
+            outliers = found.segmentation.outliers
+            objects = found.objects if outliers is None else [obj.without(outliers) for obj in found.objects]
 
             def prepare(obj: SeenObject) -> SeenObject:
                 plane = supports.support(obj, objects, depth, camera, found.segmentation, options)
@@ -312,7 +312,7 @@ class Recoverer:
             return segments.from_labels(readings.labels, depth, camera, options)
         proposed = segments.proposed(depth, camera, options.depth_range)
         if options.repair and isinstance(self._network_for(readings), inference.ThingPredictor):
-            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared)
+            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared, options.max_size)
             return segments.limited(network.improved(proposed), depth, camera, options)
         return segments.limited(segments.judged(proposed), depth, camera, options)
 

@@ -49,7 +49,7 @@ class SeenObject:
     unread : (n,)
         Those that were not measured, as indices into the image: a mask from colour tells that the object is there.
     mask : bool (height, width)
-        What measured it: those pixels without strays, or with what goes on from them (:func:`completed`);
+        What measured it: those pixels without outliers, or with what goes on from them (:func:`completed`);
         ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask, depth and camera.
     plane : (4,) or None
         What it stands on.
@@ -111,9 +111,9 @@ class SeenObject:
         heights = heights[:: max(1, heights.size // _POINTS)]
         return quantile(heights, _LOWEST), quantile(heights, 0.5)
 
-    def without(self, strays: np.ndarray) -> SeenObject:
-        """The object without the pixels that are set in ``strays``, bool (height, width)."""
-        return replace(self, mask=self.mask & ~strays)
+    def without(self, outliers: np.ndarray) -> SeenObject:
+        """The object without the pixels that are set in ``outliers``, bool (height, width)."""
+        return replace(self, mask=self.mask & ~outliers)
 
     def of_readings(self, depth: np.ndarray, gaps: np.ndarray, labels: np.ndarray) -> SeenObject:
         """The object in an image (height, width) that has no readings in its ``gaps``, bool (height, width)."""
@@ -133,7 +133,7 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
         window = slice(top, top + height), slice(left, left + width)
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(mask[window]))
-        unread = np.flatnonzero(named ^ mask)
+        unread = np.flatnonzero(named ^ mask) if np.count_nonzero(named) > pixels else np.zeros(0, np.int64)
         masked, fills = pixels + len(unread), regions.fills((left, top, width, height), measured)
         seen.append(SeenObject(label, pixels, masked, unread, mask, depth[window], camera_crop, window, fills=fills))
     return seen

@@ -9,11 +9,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_parts, support_surface
+from sq_perception.segmentation import convex_parts
 from sq_perception.segmentation.support_surface import SupportSurface
 
 LEAST_SIGMA = 5e-4
@@ -29,10 +28,6 @@ _GROWN = 3
 _GAP = 0.1
 """Share of the depth by which pixels of a surface with steps in it differ at most: what lies behind a fringe is
 farther."""
-_JAGGED = 0.3
-"""Share of the pixels of such a surface that stand out, by a step, from both their neighbours along a row or a column,
-beyond which it is noise: of independent noise most do, of a side seen at a grazing angle hardly any."""
-
 
 def above(
     known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
@@ -46,7 +41,6 @@ def above(
     clear = cv2.blur(relative, (3, 3)) > support.clear_height
     # The mean beside a tall body is that of its height: the pixel itself decides there.
     raised = relative > 0.5 * support.clear_height
-    raised &= ~support_surface.risen(relative, known, valid, camera)
     clear &= raised
     left, top, width, height = regions.box(clear)
     if width == 0:
@@ -85,33 +79,8 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
     if np.count_nonzero(left) < least:
         return labels
     # A side that is seen at a grazing angle has steps all over, but all one way.
-    steep = _large(depth_steps.separate(depth, left, _GAP), least)
-    jagged = _jagged_share(steep, depth, int(steep.max()), np.float32(depth_steps.STEP))
-    steep[(jagged > _JAGGED)[steep]] = 0
+    steep = _large(depth_steps.separated(depth, left, _GAP), least)
     return np.where(steep > 0, steep + labels.max(), labels)
-
-
-@kernel
-def _jagged_share(labels: np.ndarray, depth: np.ndarray, count: int, step: np.float32) -> np.ndarray:
-    """Share (count + 1,) of the pixels of each label that are nearer, or farther, than both their neighbours along a
-    row or a column, by a share of the depth."""
-    pixels, jagged = np.zeros(count + 1), np.zeros(count + 1)
-    rows, columns = labels.shape
-    for v in range(rows):
-        for u in range(columns):
-            label = labels[v, u]
-            if label == 0:
-                continue
-            pixels[label] += 1
-            stands_out = False
-            for down, right in ((0, 1), (1, 0)):
-                if v >= down and u >= right and v + down < rows and u + right < columns:
-                    before, after = depth[v - down, u - right], depth[v + down, u + right]
-                    less, most = min(before, after), max(before, after)
-                    nearer = less - depth[v, u] > step * depth[v, u]
-                    stands_out |= less > 0 and (nearer or depth[v, u] - most > step * most)
-            jagged[label] += stands_out
-    return jagged / np.maximum(pixels, 1.0)
 
 
 def _large(labels: np.ndarray, least: float) -> np.ndarray:

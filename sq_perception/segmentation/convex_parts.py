@@ -14,8 +14,7 @@ That holds over the whole width of the bodies: noise that bends the surface wher
 
 Steps
 -----
-1. A segment is taken apart into the convex pieces that it has (:mod:`sq_perception.segmentation.convex_pieces`), and
-   large ones of these again.
+1. A segment is taken apart into the convex pieces that it has (:mod:`sq_perception.segmentation.convex_pieces`).
 2. Neighbouring segments between which few pairs are crossed are one body; if one is a bit, up to nearly half of them.
 3. So are the inside of a vessel and its wall, of which the inside is a step behind the near rim: a hollow segment and
    one before it, if a large share of the border of both is such a step.
@@ -29,13 +28,11 @@ Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_pieces, crossings
+from sq_perception.segmentation import convex_pieces, line_of_sight
 from sq_perception.segmentation.convex_pieces import AS_ONE
 from sq_perception.segmentation.sampled_image import FEW, SampledImage, Samples, least_area
 
@@ -43,21 +40,15 @@ _NEAR = 0.03
 """Neighbouring segments are no farther apart, metres: along the line of sight where they meet in the image, or beyond
 the distance of their samples."""
 _RIM = 0.12
-"""Share of an inside's border that lies behind another segment, and of the border of that: of 12 recorded bowls, pots
-and mugs 0.13 and more of both, of 31 of 33 simulated insides beside a nearer thing that is not theirs less of one."""
-_BIT_AS_ONE = 0.45
-"""Share of crossed pairs below which a bit, too small to be a body beside one, is one body with what it is beside:
-handles and what noise broke off.  Of 2507 simulated things as many are missed as with 0.3, and 181 segments are
-none of a thing, not 189; with 0.55 low things beside tall ones are lost."""
+"""Share of an inside's border that lies behind another segment, and of the border of that."""
 _OF_RIM = 0.1
 """Share of that border at which a piece of the other segment is a part of the wall: noise may take a wall apart, and
 other things touch it."""
+_BIT_AS_ONE = 0.45
+"""Share of crossed pairs below which a bit, too small to be a body beside one, is one body with what it is beside:
+handles and what noise broke off."""
 _HOLLOW_DEPTH = 0.3
 """A step down into a hollow is not deeper, metres; no vessel on a table is."""
-_SHARE_AGAIN = 2.0
-"""What a part of a piece shows, in what a body that is attached to another shows at least: a piece is taken apart only
-where it is two large things.  With a half, as at first, 14 recorded frames have two more bodies of nothing; without a
-second look three stacked boxes are two."""
 _ALONG = 0.15
 """Share of lines that go along both surfaces, of two segments that are one behind a nearer one: two of a box show two
 faces each, of which a fourth or more of the lines stay in one."""
@@ -102,23 +93,6 @@ def corrected(
     return regions.renumber(image.labels, number_of)
 
 
-def continued(
-    labels: np.ndarray, names: Sequence[int], depth: np.ndarray, camera: Camera, sigma: float
-) -> list[tuple[int, int]]:
-    """Pairs of some segments, by their labels, that go on behind something nearer, as step 4 has it.
-
-    Images as for :func:`corrected`.
-    """
-    image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), labels, camera, sigma)
-    extents = regions.extents(labels)
-    parts = [part for name in names if (part := image.sampled(name, extents[name], FEW)) is not None]
-    if len(parts) < 2:
-        return []
-    sampled = np.array([part.label for part in parts])
-    pairs = np.argwhere(_go_on(image, sampled, _together(parts), np.ones((len(parts), len(parts)), bool)))
-    return [(parts[a].label, parts[b].label) for a, b in pairs if a < b]
-
-
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by parting and joining two balls."""
     camera = Camera(64, 48, 120.0, 120.0, 31.5, 23.5)
@@ -147,10 +121,8 @@ def _insides(image: SampledImage, rims: np.ndarray, parts: list[Samples], origin
 
 
 def _is_hollow(image: SampledImage, part: Samples) -> bool:
-    """Whether the surface lies behind its own lines, as that of a vessel does, and is no wider than a vessel."""
-    if part.width > convex_pieces.WIDEST_HOLLOW:
-        return False
-    gap = crossings.gaps(part.pixels, part.points, image.depth, image.labels).mean()
+    """Whether the surface lies behind its own lines, as that of a vessel does."""
+    gap = line_of_sight.gaps(part.pixels, part.points, image.depth, image.labels).mean()
     return bool(gap > convex_pieces.HOLLOW * image.sigma * part.distance**2)
 
 
@@ -163,23 +135,22 @@ def _parted(image: SampledImage) -> tuple[list[Samples], list[int]]:
     extents = regions.extents(image.labels)
     origin = list(range(len(extents)))
     order = np.argsort(-extents[:, 0], kind="stable")
-    waiting = [(int(label), extents[label], convex_pieces.LEAST_SHARE) for label in order if extents[label, 0] > 0]
     parts = []
-    while waiting:
-        label, extent, least_share = waiting.pop()
-        part = image.sampled(label, extent, FEW)
+    for label in order[extents[order, 0] > 0].tolist():
+        part = image.sampled(label, extents[label], FEW)
         if part is None:
             continue
-        pieces = convex_pieces.pieces(image, part, extent, least_share)
+        pieces = convex_pieces.pieces(image, part, extents[label])
         if not pieces:
             parts.append(part)
         for k, (rows, columns) in enumerate(pieces):
             name = len(origin) if k > 0 else label
             if k > 0:
-                origin.append(origin[label])
+                origin.append(label)
             image.labels[rows, columns] = name
             sides = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
-            waiting.append((name, np.array([len(rows), *sides]), _SHARE_AGAIN))
+            sampled = image.sampled(name, np.array([len(rows), *sides]), FEW)
+            parts += [] if sampled is None else [sampled]
     return parts, origin
 
 
@@ -197,9 +168,9 @@ def _crossed_between(
     names = np.array([part.label for part in parts])
     together = pixels, points, ends = _together(parts)
     borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)
-    met, beside, behind = (each[np.ix_(names, names)] for each in borders)
+    beside, behind = (each[np.ix_(names, names)] for each in borders[1:])
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
-    crossed = crossings.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
+    crossed = line_of_sight.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
     extents = regions.extents(image.labels)
     is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
@@ -209,9 +180,6 @@ def _crossed_between(
         before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
         vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
         crossed[np.ix_(vessel, vessel)] = 0.0
-    # The bottom of a vessel is seen over its wall alone: no line tells it from the bottom of the next one.
-    is_enclosed = regions.find_enclosed(borders[0])[names]
-    crossed[(is_enclosed[:, None] | is_enclosed) & (met == 0)] = np.inf
     return crossed
 
 
@@ -222,7 +190,7 @@ def _go_on(
 
     ``names`` are the labels (n,) of the segments, ``together`` their samples as by :func:`_together`.
     """
-    along, over = crossings.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
+    along, over = line_of_sight.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
     return np.asarray(wanted & (along > _ALONG) & (over < AS_ONE))
 
 

@@ -6,7 +6,7 @@ one stands alone.  Of the heights of a segment above the support
 
     a face is where most of them lie within a tolerance of one height,
 
-higher than the support is ever seen risen; it is a plane with the normal of the support, and more points lie on it
+clearly higher than the support; it is a plane with the normal of the support, and more points lie on it
 than above it: the bottom of a vessel lies low, and its wall is most of what is seen of it.
 
 Metres, optical frame.
@@ -25,8 +25,14 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.extent import TURNS, across
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
-from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
+from sq_perception.segmentation.support_surface import SupportSurface
 
+_LOWEST = 5.0
+"""Tolerances above the support at which a face lies at least: lower ones are books and bumps."""
+_LEVEL = 0.99
+"""Cosine between the normals of the support and of a face at least."""
+_LAYER = 0.7
+"""Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
 _SAMPLES, _FEWEST = 400, 30
 """Samples of a segment, evenly taken, and the fewest of a face of it: of an upright side 11 cm high 29 lie within a
 tolerance of one height.  With twice as many of both, 30 instead of 32 of 289 simulated things on cartons and stools are
@@ -113,9 +119,9 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     height = support.plane.height(points)
     reach = TOLERANCE * quantile(growth, 0.5)
     ordered = np.sort(height)
-    if ordered[-_FEWEST] < HIGHEST * reach:
+    if ordered[-_FEWEST] < _LOWEST * reach:
         return None
-    ordered = ordered[ordered >= HIGHEST * reach]
+    ordered = ordered[ordered >= _LOWEST * reach]
     level = ordered[densest(ordered, reach)]
     if len(level) < _FEWEST:
         return None
@@ -125,9 +131,9 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
         off = (points @ plane[:3] + plane[3]) / growth
         on = np.abs(off) < TOLERANCE
         count = np.count_nonzero(on)
-        if count < max(_FEWEST, support_plane.LAYER * np.count_nonzero(np.abs(off) < 2 * TOLERANCE)):
+        if count < max(_FEWEST, _LAYER * np.count_nonzero(np.abs(off) < 2 * TOLERANCE)):
             return None
-        if plane[:3] @ support.plane.equation[:3] < support_plane.LEVEL:
+        if plane[:3] @ support.plane.equation[:3] < _LEVEL:
             return None
     sigma = max(support.sigma, deviation(np.abs(off[on])))
     face = Plane(plane, np.count_nonzero(on) / len(points), sigma)

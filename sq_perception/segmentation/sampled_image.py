@@ -52,11 +52,6 @@ class Samples:
         """Median depth."""
         return quantile(self.z, 0.5)
 
-    @property
-    def width(self) -> float:
-        """The larger side of the box around the segment across the line of sight, metres."""
-        return float(np.ptp(self.points[:, :2], axis=0).max())
-
 
 @dataclass(frozen=True, eq=False)
 class SampledImage:
@@ -74,7 +69,7 @@ class SampledImage:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """``noise`` and ``least`` by which a line is crossed (:mod:`sq_perception.segmentation.crossings`)."""
+        """``noise`` and ``least`` by which a line is crossed (:mod:`sq_perception.segmentation.line_of_sight`)."""
         return _NOISE_MARGIN * self.sigma, _LEAST_GAP
 
     def sampled(self, label: int, extent: np.ndarray, count: int) -> Samples | None:

@@ -8,7 +8,7 @@ Steps
    where none between them does (:mod:`sq_perception.segmentation.bodies`).
 3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
    than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
-4. Walls of a bin or a tray around things go (:mod:`sq_perception.segmentation.enclosures`).
+4. Walls of a bin or a tray around things go (:mod:`sq_perception.segmentation.container_walls`).
 5. Each is a thing with a probability (:mod:`sq_perception.segmentation.objectness`), which a network that sees it in
    its surroundings sharpens (:mod:`sq_perception.recovery.own_segments`).
 6. Limits of size and place, and of number, are asked of what then remains.
@@ -33,8 +33,8 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     bodies,
+    container_walls,
     convex_parts,
-    enclosures,
     level_faces,
     objectness,
     pieces,
@@ -77,14 +77,12 @@ class Segmentation:
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
     is_cut
         Whether there were more objects than ``max_objects``.
-    strays : bool (height, width) or None
+    outliers : bool (height, width) or None
         Pixels of objects that did not measure them; None: not a single one that is known.
     objectness : tuple of float
         The probability, by ``ids``, that each is a thing; 1 for labels given from outside.
     larger, outside
         How many objects were left out as they are larger than ``max_size``, or outside of the workspace.
-    claims : tuple of pairs
-        Labels a, b: a network says that most of b is of the object that a shows.
     heights : HeightEvidence or None
         What the segments are judged by, until they are.
     """
@@ -94,11 +92,10 @@ class Segmentation:
     ids: tuple[int, ...]
     sigma: float = _UNKNOWN_SIGMA
     is_cut: bool = False
-    strays: np.ndarray | None = None
+    outliers: np.ndarray | None = None
     objectness: tuple[float, ...] = ()
     larger: int = 0
     outside: int = 0
-    claims: tuple[tuple[int, int], ...] = ()
     heights: HeightEvidence | None = None
 
 
@@ -135,7 +132,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     is_silhouette = _is_silhouette(valid)
-    if is_silhouette and largest_edge(_some_points(valid, known, camera)) <= LARGEST_THING:
+    if is_silhouette and _size(valid, known, camera) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera)
@@ -148,7 +145,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     tops = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(tops, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, camera, least)
-    around = enclosures.walls(tops, plane.equation)
+    around = container_walls.walls(tops, plane.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
     found = _ordered(Segmentation(labels, plane.equation, (), sigma), least)
     if is_silhouette and not found.ids:
@@ -167,7 +164,7 @@ def judged(found: Segmentation) -> Segmentation:
 
 def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
     """The segments of some labels, with the probability that each is a thing; renumbered from 1, the largest first."""
-    counts = np.bincount(found.labels.ravel(), minlength=max(likely, default=0) + 1)
+    counts = regions.extents(found.labels)[:, 0]
     order = sorted(likely, key=lambda label: (-counts[label], label))
     number = np.zeros(len(counts), np.int32)
     number[order] = np.arange(len(order)) + 1
@@ -176,26 +173,24 @@ def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
         labels=regions.renumber(found.labels, number),
         ids=tuple(range(1, len(order) + 1)),
         objectness=tuple(likely[label] for label in order),
-        claims=tuple((int(number[a]), int(number[b])) for a, b in found.claims if number[a] and number[b]),
     )
 
 
 def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> Segmentation:
-    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``.
-
-    What claims to be a piece of one that is too large is left out as well.
-    """
+    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
     depth, valid = _checked(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
     larger, outside = set(), set()
+    extents = regions.extents(found.labels)
     for label in found.ids:
-        points = _some_points((found.labels == label) & valid, depth, camera)
+        rows, columns = regions.pixels(found.labels, label, extents[label])
+        seen = valid[rows, columns]
+        points = regions.some_points(rows[seen], columns[seen], depth, camera, _POINTS)
         if camera.is_pinhole and not options.is_small(points, up):
             larger.add(label)
         elif not options.is_within(points):
             outside.add(label)
-    of_larger = {one for one, other in found.claims if other in larger}
-    left = [label for label in found.ids if label not in larger | outside | of_larger]
+    left = [label for label in found.ids if label not in larger | outside]
     ids = left[: options.max_objects]
     likely = dict(zip(found.ids, found.objectness or (1.0,) * len(found.ids), strict=True))
     is_cut = found.is_cut or len(left) > len(ids)
@@ -295,9 +290,9 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
-def _some_points(wanted: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    rows, columns = np.nonzero(wanted)
-    return regions.some_points(rows, columns, depth, camera, _POINTS)
+def _size(valid: np.ndarray, depth: np.ndarray, camera: Camera) -> float:
+    rows, columns = np.nonzero(valid)
+    return largest_edge(regions.some_points(rows, columns, depth, camera, _POINTS))
 
 
 def _is_silhouette(valid: np.ndarray) -> bool:
@@ -331,7 +326,7 @@ def _unloaded(
 
 def _ordered(found: Segmentation, least: int) -> Segmentation:
     """The largest segments of at least so many pixels."""
-    counts = np.bincount(found.labels.ravel())
-    order = np.argsort(-counts[1:], kind="stable") + 1
+    counts = regions.extents(found.labels)[:, 0]
+    order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
     return kept(replace(found, is_cut=len(order) > _MOST), dict.fromkeys(order[:_MOST].tolist(), 1.0))

@@ -9,16 +9,15 @@ n.p + d = 0 with |n| = 1 in the optical frame and n towards the camera, so that 
 one multiplication per pixel.  Depth noise of triangulating and time-of-flight cameras grows about as z^2; tolerances
 are therefore sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.
 
-Planes are found by RANSAC on a seeded subsample and least squares on the inliers.  Of a share s of the points, n draws
-of three miss a plane with the probability (1 - s^3)^n: more are drawn where no large plane is found.  The table is the
-one with many points that lies low in the image, right below what is on no plane.
+Planes are found by RANSAC on a seeded subsample and least squares on the inliers: n draws of three miss a plane with a
+share s of the points with the probability (1 - s^3)^n.  The table is the one with many points that lies low in the
+image, right below what is on no plane.
 
 Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import cv2
@@ -28,48 +27,26 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import coarse_grid
-from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 
 TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
-_LEAST_SHARE = 0.1
+_LEAST_SHARE = 0.05
 """Share of the valid pixels that a plane has at least."""
-_LEAST_BEFORE_WALL, _FRONTAL = 0.03, 0.3
-"""That share where only planes were found that face the camera, and the cosine between their normals and the image's
-vertical at most: before a wall a low camera sees little of a table.  What faces the camera too is the front of a
-thing."""
 _SEED = 0
 """Seed of the random samples; the same image gives the same planes."""
 _PLANE_POINTS, _REFINE_POINTS = 1500, 8000
 """On so many points planes are counted, and the best one is fitted: a share of a tenth is then known to 8 % of itself,
 and a height to a hundredth of the noise."""
-_HYPOTHESES, _MOST_HYPOTHESES, _MISSED = 200, 2000, 0.01
-"""Draws at first, and at most until a plane is missed with that probability.  200 alone missed a table of 10 to 15 % of
-the points seven times of 20."""
-LAYER = 0.7
-"""Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
-_FEW_POINTS, _FINALISTS = 300, 100
-"""On so many points more draws are counted, and the best of them on all."""
+_HYPOTHESES, _FEW_POINTS, _FINALISTS = 1000, 300, 50
+"""So many draws are counted on a few points, and the best of them on all: of 15 % of the points one plane in thirty is
+missed, of 10 % one in three."""
 _PLANES = 3
 """A table, the floor below it and a wall behind it."""
 _APART = 2
 """Pixels next to a body that are none of its surroundings, as they may show either."""
-LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
-"""Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
-shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
-
-_CLOSE, _HELD_SHARE = 0.6, 0.1
-"""Metres above a support in which what stands on it is, and the least share of what is on no plane that is there: the
-wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
 _TYPICAL_HEIGHT, _FAR = 0.1, 0.1
-"""Metres above their support of what is on no plane: exp(-h / this) is near.  A bin's wall, seen from above, is below
-the middle of the image as a table is, but things are anywhere before it, not on it.  The square of the mean counts: of
-four recorded bins the bottom was chosen once without, always with it; simulated stools, boards and cartons gain.
-And that mean at least: where all is far from all planes, it says nothing."""
-_STRAY = 0.003
-"""Share of the points that may be on no plane although nothing is there: of normal noise 0.3 % lies beyond three
-deviations, and tolerances are wider."""
+"""Metres above their support of what is on no plane: exp(-h / this) is near.  The mean of that at least: where all is
+far from all planes, it says nothing."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
@@ -110,12 +87,10 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
     total = len(points)
     found: list[Plane] = []
     for _ in range(_PLANES):
-        walls_alone = bool(found) and all(abs(plane.equation[1]) < _FRONTAL for plane in found)
-        least = (_LEAST_BEFORE_WALL if walls_alone else _LEAST_SHARE) * total
-        if len(points) < max(12, least):
+        if len(points) < max(12, _LEAST_SHARE * total):
             break
-        plane, inside = _dominant_plane(points, least / len(points), rng)
-        if plane is None or inside.sum() < (_LEAST_SHARE * total if abs(plane[1]) < _FRONTAL else least):
+        plane, inside = _dominant_plane(points, rng)
+        if plane is None or inside.sum() < _LEAST_SHARE * total:
             break
         near = points[inside]
         spread = np.abs(near @ plane[:3] + plane[3]) / noise_growth(near[:, 2])
@@ -130,15 +105,12 @@ def support(
     valid: np.ndarray,
     camera: Camera,
 ) -> Plane | None:
-    """The plane that things stand on, of some planes of an image; None if none of them is one.
+    """The plane that things stand on, of some planes of an image; None if there are none.
 
     The support has many points, and a normal that points up in the image.  The camera is mounted upright or looks
     straight down; a table seen from straight above has the normal of a wall, so that such planes count as well, though
     less: where there is a wall, a floor or a table in the same image has a normal that points up.  What stands on a
-    support begins right above it.  Of a table and the floor below it the table is the support, even if the image shows
-    more of the floor; a plane no larger than a thing is such a table only if it has a good share of the floor's points.
-
-    A plane with hardly anything close above it is none, such as a wall metres behind the table of a low camera.
+    support begins right above it.
 
     Parameters
     ----------
@@ -150,23 +122,8 @@ def support(
     if not candidates:
         return None
     points = _some_points(depth, valid, camera, _PLANE_POINTS)
-    held, near, rest = _held(candidates, points)
-    votes = {plane: _vote(plane) * share**2 for plane, share in zip(candidates, near, strict=True)}
-    best = max(votes, key=votes.__getitem__)
-    if rest > _STRAY and abs(best.equation[1]) < _FRONTAL and max(held) < _HELD_SHARE:
-        return None
-
-    def is_thing(plane: Plane) -> bool:
-        return largest_edge(_largest_part(plane, depth, valid, camera), plane.equation[:3]) <= LARGEST_THING
-
-    tables = [
-        plane
-        for plane in votes
-        if plane.equation[:3] @ best.equation[:3] > LEVEL
-        and best.equation[3] - plane.equation[3] > _STOREY
-        and (plane.share > _TABLE_SHARE * best.share or not is_thing(plane))
-    ]
-    return max(tables, key=votes.__getitem__) if tables else best
+    near = _nearness(candidates, points)
+    return max(zip(candidates, near, strict=True), key=lambda each: _vote(each[0]) * each[1] ** 2)[0]
 
 
 def around(
@@ -224,30 +181,17 @@ def _some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera, count: i
     return camera.unproject(columns, rows, depth[rows, columns])
 
 
-def _dominant_plane(points: np.ndarray, least: float, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
-    """The plane (4,) with most points within the tolerance * z^2, and which points these are.
-
-    One with a share of less than ``least`` of them need not be found.
-    """
+def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
+    """The plane (4,) with most points within the tolerance * z^2, and which points these are."""
     few = points[:: max(1, len(points) // _PLANE_POINTS)]
     weight = (1 / (TOLERANCE * noise_growth(few[:, 2]))).astype(np.float32)
     weighted = np.stack([*few.T, np.ones(len(few))]).astype(np.float32) * weight
     candidates = _through_three(few, _HYPOTHESES, rng)
     if not len(candidates):
         return None, np.zeros(len(points), bool)
-    votes = _votes(candidates, weighted)
-    best, most = candidates[votes.argmax()], int(votes.max())
-    share = max(most / len(few), least)
-    needed = math.log(_MISSED) / math.log1p(-(min(share, 0.99) ** 3))
-    if needed > _HYPOTHESES:
-        more = _through_three(few, min(round(needed), _MOST_HYPOTHESES), rng)
-        fewer = np.ascontiguousarray(weighted[:, :: max(1, len(few) // _FEW_POINTS)])
-        more = more[np.argsort(-_votes(more, fewer), kind="stable")[:_FINALISTS]]
-        votes = _votes(more, weighted)
-        top = more[votes.argmax()][None] if len(more) else more
-        # Of points all over the room a tenth may lie in a layer as thick, but as many beside it.
-        if len(top) and votes.max() > max(most, LAYER * _votes(top, weighted / 2)[0]):
-            best = top[0]
+    fewer = np.ascontiguousarray(weighted[:, :: max(1, len(few) // _FEW_POINTS)])
+    finalists = candidates[np.argsort(-_votes(candidates, fewer), kind="stable")[:_FINALISTS]]
+    best = finalists[_votes(finalists, weighted).argmax()]
     plane = best.astype(float)
     growth = noise_growth(points[:, 2])
     reach, weights, rows = TOLERANCE * growth, growth**-2, np.ascontiguousarray(points.T)
@@ -291,35 +235,13 @@ def least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
 
 
-def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
-    """Points (n, 3) of a coarse image that lie on a plane, of the largest connected part: the tops of two cartons may
-    lie in one plane."""
-    k, rows, columns, points = coarse_grid.samples(depth, valid, camera)
-    on = _lie_on(plane, points)
-    part = coarse_grid.connected_parts(rows, columns, on, depth[::k, ::k].shape)
-    counts = np.bincount(part)
-    counts[0] = 0
-    return np.asarray(points[on & (part == counts.argmax())])
-
-
-def _lie_on(plane: Plane, points: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) lie within the tolerance of a plane."""
-    return np.asarray(np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2]))
-
-
-def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], list[float], float]:
-    """How well each of some planes explains the points that lie on none of them, by two measures, and their share.
-
-    First the share of these points that is as close above the plane as what stands on a support, then how near above it
-    they are, 0 to 1.  ``points`` (n, 3) are all of the image.
-    """
+def _nearness(candidates: list[Plane], points: np.ndarray) -> np.ndarray:
+    """How near above each of some planes (n,) the points (m, 3) are that lie on none of them, 0 to 1."""
     heights = np.stack([plane.height(points) for plane in candidates])
     rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
     if not rest.size:
-        return [0.0] * len(candidates), [1.0] * len(candidates), 0.0
-    held = np.mean((rest > 0) & (rest < _CLOSE), axis=1)
-    near = np.mean(np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0), axis=1)
-    return held.tolist(), np.maximum(near, _FAR).tolist(), rest.shape[1] / len(points)
+        return np.ones(len(candidates))
+    return np.maximum(np.mean(np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0), axis=1), _FAR)
 
 
 def _vote(plane: Plane) -> float:

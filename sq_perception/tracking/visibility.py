@@ -13,7 +13,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import perforation
+from sq_perception.imaging import hole_filling
 from sq_perception.imaging.camera import Camera
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
@@ -51,11 +51,11 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
     measured = _readings(depth[row, column].astype(float), camera)
     if (inside & ~np.isfinite(measured)).any():  # perhaps a gap between readings of one surface
-        measured = perforation.fill(_readings(depth, camera))[0][row, column].astype(float)
+        measured = hole_filling.filled(_readings(depth, camera))[0][row, column].astype(float)
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
     behind = np.where(inside & np.isfinite(measured), measured, -np.inf) - points[..., 2]
-    clear, told = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)
-    return clear / np.maximum(told, 1)
+    clear, observed = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)
+    return clear / np.maximum(observed, 1)
 
 
 def _readings(depth: np.ndarray, camera: Camera) -> np.ndarray:

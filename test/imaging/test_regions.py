@@ -32,10 +32,3 @@ def test_contacts_go_across_pixels_without_a_depth():
     met, _, behind = regions.borders(labels, depth, 2, NEAR, FAR)
     assert met[1, 2] == 0
     assert not behind.any(), "nothing is behind what has no label"
-
-
-def test_what_others_surround_is_enclosed():
-    labels = np.ones((9, 9), np.int32)
-    labels[3:6, 3:6] = 2
-    met, _, _ = regions.borders(labels, np.ones(labels.shape, np.float32), 2, NEAR, FAR)
-    np.testing.assert_array_equal(regions.find_enclosed(met)[1:], [False, True])

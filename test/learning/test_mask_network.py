@@ -66,8 +66,8 @@ def test_a_training_learns_goes_on_and_is_read_again(tmp_path: Path, rng: np.ran
     config = replace(MASK_RUN, minutes=0.1, batch=8, threads=1, held=1, validation=5)
     first = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert records[-1]["strays"] == pytest.approx(1, abs=0.1)
-    assert records[-1]["left"] < records[-1]["strays"]
+    assert records[-1]["outliers"] == pytest.approx(1, abs=0.1)
+    assert records[-1]["left"] < records[-1]["outliers"]
     shard_training.train(subject, replace(config, minutes=0.12), tmp_path / "views", tmp_path / "run")
     more = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert more[len(records)]["step"] > records[-1]["step"]
@@ -164,7 +164,7 @@ def test_shards_without_a_view_are_named(
 def test_views_of_no_object_have_figures(rng: np.random.Generator) -> None:
     images = rng.random((2, PIXELS, PIXELS, CHANNELS)).astype(np.float16)
     found = mask_training.validate(MaskNetwork(SMALL), SegmentViews(images, np.full((2, PIXELS, PIXELS), NO, np.uint8)))
-    assert found["strays"] > 0 == found["lost"]
+    assert found["outliers"] > 0 == found["lost"]
 
 
 def test_a_shard_that_comes_before_those_held_is_trained_on(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -213,9 +213,9 @@ def test_weights_of_another_kind_are_refused() -> None:
     assert "masks" not in checkpoint.shipped_regressors()
 
 
-def test_the_shipped_network_finds_strays_in_scenes_that_it_has_not_seen() -> None:
+def test_the_shipped_network_finds_outliers_in_scenes_that_it_has_not_seen() -> None:
     """More than half of them, for a fiftieth of the objects' readings."""
     found = mask_training.validate(checkpoint.load_masks(), draw_segment_views(12, np.random.default_rng([77, 5])))
-    assert found["strays"] > 0.03
-    assert found["left"] < 0.6 * found["strays"]
+    assert found["outliers"] > 0.03
+    assert found["left"] < 0.6 * found["outliers"]
     assert found["lost"] < 0.03

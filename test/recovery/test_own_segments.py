@@ -1,4 +1,4 @@
-"""Own segments through the network of masks: strays go, pieces of one thing are joined, two things stay two."""
+"""Own segments through the network of masks: outliers go, pieces of one thing are joined, two things stay two."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def shipped() -> Any:
 @pytest.mark.xfail(
     reason="a network that knows sensors without rims takes one without noise for the can's", strict=True
 )
-def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
+def test_the_rim_that_a_sensor_adds_is_an_outlier(shipped: Any) -> None:
     """Every pixel within two of the can shows the can's depth, as stereo matching has it."""
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     brush = np.ones((5, 5), np.uint8)
@@ -75,14 +75,14 @@ def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
     depth = np.where(wider & (truth == 0), cv2.erode(np.where(truth > 0, depth, np.inf), brush), depth)
     found = of(shipped, depth.astype(np.float32)).improved(segmentation(wider.astype(np.int32)))
     np.testing.assert_array_equal(found.labels, wider)
-    assert not (found.strays & ~wider).any()
-    own = wider & ~found.strays
+    assert not (found.outliers & ~wider).any()
+    own = wider & ~found.outliers
     rim = wider & (truth == 0)
     assert np.count_nonzero(own & rim) < 0.6 * np.count_nonzero(rim)
     assert np.count_nonzero(own & (truth > 0)) > 0.95 * np.count_nonzero(truth)
 
 
-def test_the_rim_that_a_stereo_camera_adds_is_stray(shipped: Any) -> None:
+def test_the_rim_that_a_stereo_camera_adds_is_an_outlier(shipped: Any) -> None:
     """Pixels beside a can show the can's depth, as the windows that are matched hold some of it."""
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     wider = cv2.dilate((truth > 0).view(np.uint8), np.ones((7, 7), np.uint8)) > 0
@@ -93,8 +93,8 @@ def test_the_rim_that_a_stereo_camera_adds_is_stray(shipped: Any) -> None:
         can = wider & (np.abs(measured - np.median(depth[truth > 0])) < CAN[0][0])
         found = of(shipped, measured).improved(segmentation(can.astype(np.int32)))
         np.testing.assert_array_equal(found.labels, can)
-        assert not (found.strays & ~can).any()
-        counts += [[np.sum(each & (truth > 0)), np.sum(each & (truth == 0))] for each in (can, can & ~found.strays)]
+        assert not (found.outliers & ~can).any()
+        counts += [[np.sum(each & (truth > 0)), np.sum(each & (truth == 0))] for each in (can, can & ~found.outliers)]
     before, after = counts
     assert before[1] > 0.1 * before[0]
     assert after[1] < 0.4 * before[1]
@@ -145,25 +145,6 @@ def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
     assert abs(len(first) - len(second)) < 0.2 * len(first)
 
 
-@pytest.mark.parametrize(("before", "parts"), [(0.1, 1), (-0.1, 2)])
-def test_the_ends_of_a_box_behind_a_post_stay_one_whatever_the_network_says(before: float, parts: int) -> None:
-    """It doubts the box, and takes its halves for two things; so they are where what is between them is farther."""
-    depth, truth = seen([TABLE.body(0, 0, (0.1, 0.03, 0.05), (0.1, 0.1))])
-    post = np.abs(np.arange(CAMERA.width) - np.median(np.nonzero(truth)[1])) < 10
-    labels = np.where(post, 2, 1) * truth
-    depth = np.where(labels == 2, depth - before, depth).astype(np.float32)
-
-    def doubts_the_box(views: np.ndarray) -> np.ndarray:
-        if network.asked > 2:  # pieces of the box
-            return claims_of_halves(views)
-        return np.where(views[..., segment_view.SEGMENT] > 0, np.array([1.2, 3.0])[:, None, None], -3.0)
-
-    network = GivenLogits(doubts_the_box)
-    found = of(network, depth).improved(segmentation(labels))
-    assert len(np.unique(found.labels[labels == 1])) == parts
-    assert len(found.ids) == parts + 1
-
-
 def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     """The network sees an object in the right half, and none in the left one, as where a sensor smeared an edge."""
 
@@ -185,7 +166,7 @@ def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
 
 
 def test_pieces_are_joined_until_none_belong_together() -> None:
-    """Four quarters of which each is taken for the whole: pairs first, then the pairs; labels from 1, no strays."""
+    """Four quarters of which each is taken for the whole: pairs first, then the pairs; labels from 1, no outliers."""
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     rows, columns = np.indices(truth.shape)
     v, u = (np.median(each) for each in np.nonzero(truth))
@@ -194,8 +175,17 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
     found = of(network, depth).improved(segmentation(quarters))
     np.testing.assert_array_equal(found.labels, truth)
     assert found.ids == (1,)
-    assert not found.strays.any()
+    assert not found.outliers.any()
     assert network.asked == 4 + 2 + 1
+
+
+@pytest.mark.parametrize(("max_size", "objects"), [(0.6, 1), (0.25, 1), (0.12, 2)])
+def test_what_would_be_larger_than_an_object_is_not_joined(max_size: float, objects: int) -> None:
+    """Two cans, 0.19 m across together, of which each is taken for a part of the other."""
+    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0, *CAN)])
+    network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
+    found = replace(of(network, depth), max_size=max_size).improved(segmentation(truth))
+    assert len(found.ids) == objects
 
 
 def test_one_sided_belonging_joins_nothing() -> None:
@@ -211,8 +201,8 @@ def test_one_sided_belonging_joins_nothing() -> None:
     assert sorted(found.ids) == [1, 2]
 
 
-def stray_in_rows(share: float) -> Any:
-    """A network that takes this share of a segment's rows, from the top, for strays."""
+def outliers_in_rows(share: float) -> Any:
+    """A network that takes this share of a segment's rows, from the top, for outliers."""
 
     def logits(views: np.ndarray) -> np.ndarray:
         inside = (views[..., [segment_view.SEGMENT, segment_view.OTHERS]] > 0).any(axis=3)
@@ -222,16 +212,16 @@ def stray_in_rows(share: float) -> Any:
     return GivenLogits(logits)
 
 
-def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
+def test_a_segment_that_is_mostly_outliers_keeps_its_pixels() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(stray_in_rows(0.55), depth).improved(replace(segmentation(truth), heights=None))
+    found = of(outliers_in_rows(0.55), depth).improved(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
-    assert not found.strays.any()
+    assert not found.outliers.any()
 
 
 def test_a_segment_that_shows_no_object_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(stray_in_rows(0.8), depth).improved(segmentation(truth))
+    found = of(outliers_in_rows(0.8), depth).improved(segmentation(truth))
     assert found.ids == ()
     assert not found.labels.any()
 
@@ -240,7 +230,7 @@ def test_without_a_support_nothing_is_dropped() -> None:
     """A body alone in an image, as a renderer makes it: all that is seen is the object."""
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
-    network = SegmentNetwork(stray_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
+    network = SegmentNetwork(outliers_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
     assert network.improved(replace(segmentation(truth), plane=None, heights=None)).ids == (1,)
 
 
@@ -274,52 +264,6 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     assert len(found.ids) == 5
 
 
-def halves_alone(pixels: int, of_all: str, of_half: str = "itself") -> GivenLogits:
-    """A network that is shown a segment of so many pixels, halves and smaller pieces of it.
-
-    Of all it takes the left part, 60 %, for the object, or ``of_all`` is "nothing"; of the rest, or of a half, that
-    itself or "everything"; of a smaller piece nothing.
-    """
-
-    def logits(views: np.ndarray) -> np.ndarray:
-        answers = []
-        for mine, cell in zip(views[..., segment_view.SEGMENT] > 0, np.exp(views[:, 0, 0, GRAIN]), strict=True):
-            share = np.count_nonzero(mine) * cell**2 / pixels
-            left = np.arange(mine.shape[1]) < np.quantile(np.nonzero(mine)[1], 0.6)
-            if share > 0.75:
-                answers.append(mine & left & (of_all == "left"))
-            else:
-                answers.append((mine | (of_half == "everything")) & (share > 0.33))
-        return np.where(answers, 3.0, -3.0)
-
-    return GivenLogits(logits)
-
-
-def test_what_is_left_of_a_segment_may_be_an_object_of_its_own() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(halves_alone((truth > 0).sum(), "left"), depth).improved(segmentation(truth))
-    assert found.ids == (1, 2)
-    np.testing.assert_array_equal(found.labels > 0, truth > 0)
-    columns = [np.nonzero((found.labels == label) & ~found.strays)[1] for label in found.ids]
-    first, second = sorted(columns, key=lambda each: float(each.mean()))
-    assert first.max() < second.min()
-    assert np.count_nonzero(found.strays) < 0.1 * np.count_nonzero(truth)
-
-
-def test_what_is_left_of_a_segment_and_claims_it_stays_stray() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(halves_alone((truth > 0).sum(), "left", "everything"), depth).improved(segmentation(truth))
-    assert found.ids == (1,)
-    assert np.count_nonzero(found.strays) > 0.3 * np.count_nonzero(truth)
-
-
-def test_of_a_dropped_segment_that_is_not_connected_each_piece_is_asked_about() -> None:
-    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
-    found = of(halves_alone((truth > 0).sum(), "nothing"), depth).improved(segmentation((truth > 0).astype(np.int32)))
-    assert len(found.ids) == 2
-    assert min(ious(truth, found.labels)) > 0.95
-
-
 def test_no_segments_ask_nothing() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: views)
@@ -327,7 +271,7 @@ def test_no_segments_ask_nothing() -> None:
     assert network.asked == 0
 
 
-def test_frames_keep_the_strays_in_their_labels_and_count_them() -> None:
+def test_frames_keep_the_outliers_in_their_labels_and_count_them() -> None:
     depth, _ = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
     recoverer = Recoverer(threads=1)
     with_masks, without = (
@@ -354,10 +298,10 @@ def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quar
     upright = of(GivenLogits(upper), np.ascontiguousarray(depth), square).improved(segmentation(truth))
     plane = np.append(matrix @ PLANE[:3], PLANE[3])
     rolled = of(GivenLogits(upper), turned[0], square, plane).improved(segmentation(turned[1]))
-    assert upright.strays is not None
-    assert rolled.strays is not None
-    assert 0.05 < upright.strays.sum() / (truth > 0).sum() < 0.5
-    assert (np.rot90(rolled.strays, -quarters) != upright.strays).mean() < 0.005
+    assert upright.outliers is not None
+    assert rolled.outliers is not None
+    assert 0.05 < upright.outliers.sum() / (truth > 0).sum() < 0.5
+    assert (np.rot90(rolled.outliers, -quarters) != upright.outliers).mean() < 0.005
 
 
 @pytest.mark.parametrize(("pitch", "gap"), [(1.3, 0.02), (1.5, 0.01), (1.5, 0.05)])

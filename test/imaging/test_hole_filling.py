@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from table_scenes import VGA, Table
 
-from sq_perception.imaging import perforation
+from sq_perception.imaging import hole_filling
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes, sensor_noise
 
@@ -21,7 +21,7 @@ PATTERNS = {
 @pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
 def test_gaps_take_the_nearest_reading_and_its_label(pattern: np.ndarray) -> None:
     labels = np.where(pattern, 9, ROWS // 4 + 1)
-    filled, named, gaps = perforation.fill(np.where(pattern, np.float32(np.nan), SLOPE), labels)
+    filled, named, gaps = hole_filling.filled(np.where(pattern, np.float32(np.nan), SLOPE), labels)
     inside = np.s_[2:-4, 2:-4]
     rows, columns = np.nonzero(~pattern)
     away = np.hypot(ROWS[inside][..., None] - rows, COLUMNS[inside][..., None] - columns)
@@ -36,7 +36,7 @@ def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
     image = np.where(PATTERNS["every second line"], np.float32(np.nan), SLOPE)
     image[8:15, 8:15] = np.nan
     given, labels = image.copy(), ROWS // 4
-    filled, named, _ = perforation.fill(image, labels)
+    filled, named, _ = hole_filling.filled(image, labels)
     assert np.isnan(filled[9:14, 9:14]).all()
     assert np.isfinite(filled[:, :8]).all()
     assert named is not labels
@@ -46,11 +46,11 @@ def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
 
 def test_single_gaps_as_of_recorded_frames_stay() -> None:
     image = np.where((ROWS % 8 == 3) & (COLUMNS % 8 == 2), np.float32(np.nan), SLOPE)
-    assert perforation.fill(image) == (image, None, None)
+    assert hole_filling.filled(image) == (image, None, None)
 
 
 def test_an_image_without_gaps_is_given_back() -> None:
-    assert perforation.fill(SLOPE) == (SLOPE, None, None)
+    assert hole_filling.filled(SLOPE) == (SLOPE, None, None)
 
 
 @pytest.mark.parametrize("masks", ["given", "own"])
@@ -81,7 +81,7 @@ def test_what_stands_in_for_missing_lines_shifts_no_body(first: int) -> None:
 
 
 def test_pixels_of_a_body_are_those_that_were_measured() -> None:
-    """Also where some of its segment are strays, as the rim is that a sensor adds."""
+    """Also where some of its segment are outliers, as the rim is that a sensor adds."""
     scene = scenes.table_scene(np.random.default_rng(3), 3)
     depth = sensor_noise.preset("realsense_d435").measured(scene.render()[0], scene.camera, np.random.default_rng(4))
     depth[1::2] = np.nan

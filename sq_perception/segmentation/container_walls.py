@@ -23,7 +23,7 @@ from sq_perception.segmentation.extent import across
 
 _TOP, _AS_HIGH = 0.95, 0.008
 """Share of a segment's points below its top, and metres by which tops of walls may differ: noise of a rim."""
-_THICK, _NARROW, _STRAY = 0.03, 0.2, 0.1
+_THICK, _NARROW, _OUTLYING = 0.03, 0.2, 0.1
 """Metres from a side of the rectangle to the inside of a wall at the most, with a bin's slant and noise; the
 same as a share of half the shorter side; and the share of a segment's points that may lie farther in: a can's or a
 carton's are a third at the least, and a round vessel's 18 %."""
@@ -86,7 +86,7 @@ def _around(level: np.ndarray, points: np.ndarray, owner: np.ndarray, directions
     thick = min(_THICK, _NARROW * float(half.min()))
     placed -= (low + half)[:, None]
     inside = (half[:, None] - np.abs(placed)).min(axis=0) > thick
-    along = level & (np.bincount(owner, inside) < _STRAY * np.bincount(owner))
+    along = level & (np.bincount(owner, inside) < _OUTLYING * np.bincount(owner))
     if 2 * half.min() < _SMALLEST or not along.any():
         return np.zeros_like(along)
     # Of the four sides in their order around the rectangle, the share of their cells that hold points beside them.
