@@ -142,11 +142,11 @@ class SuperquadricArray(Columns):
     part: np.ndarray = field(default=None, metadata=column("part"))  # type: ignore[arg-type]
 
     def parts_of(self, number: int) -> SuperquadricArray:
-        """The parts of the object of this id; none where it is one body."""
+        """Return the parts of the object with this id; none where it is one body."""
         return self.where((self.part > 0) & (self.id == number))
 
     def followed_by(self, other: SuperquadricArray) -> SuperquadricArray:
-        """The rows of this one, then those of the other one."""
+        """Join the rows of this array and those of another one."""
         columns = {each.name: (getattr(self, each.name), getattr(other, each.name)) for each in fields(self)}
         return replace(self, **{name: np.concatenate(both) for name, both in columns.items()})
 

@@ -211,7 +211,7 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
 
 
 def _take_parts(found: Identified) -> Identified:
-    """The parts of a frame's objects in place of these."""
+    """Replace the objects of a frame by their parts."""
     bodies, ids = [], []
     columns: dict[str, list[int]] = {"seen": [], "reason": [], "part": []}
     for k, body in enumerate(found.recovery.bodies):
@@ -261,7 +261,7 @@ def _in_own_frames(array: SuperquadricArray) -> Superquadric:
 
 
 def _join(meshes: Sequence[Mesh], array: SuperquadricArray) -> MarkerMesh:
-    """Meshes of the bodies of a message, each in its own frame, as one in the message's frame, with their outlines."""
+    """Join meshes of the bodies of a message, each in its own frame, in the message's frame, with their outlines."""
     turns = poses.matrices(poses.unit_quaternions(array.rotation))
     vertices, faces, lines, count = [], [], [], 0
     for (own, corners), body, turn, centre in zip(meshes, _in_own_frames(array), turns, array.translation, strict=True):

@@ -116,7 +116,7 @@ def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
 
 
 def _part_entries(parts: Parts | None, is_cube: bool) -> list[dict[str, Any]]:
-    """The elements of ``parts``: none where one body explains the object."""
+    """Return the elements of ``parts``: none where one body explains the object."""
     return [
         {
             **_parameters(in_result_frame(fit.superquadric, is_cube)),

@@ -97,7 +97,7 @@ class Evidence:
         return cls(near, mask & np.isfinite(near), view, sigma)
 
     def weigh(self, fits: Sequence[Fit]) -> Weight:
-        """What the image says of the bodies of k fits together."""
+        """Compare the bodies of k fits, together, with the image."""
         with one_kernel_thread():
             rendered, index = raycast.render(Superquadric.stack([fit.superquadric for fit in fits]), self.camera)
         off = np.where(np.isfinite(rendered), rendered - self.depth, np.inf) / self.sigma
@@ -126,7 +126,7 @@ class Search:
             self._divisions = (list(_make_objects(obj, depth, camera, each)) for each in pieces)
 
     def next_pieces(self) -> list[SeenObject]:
-        """The pieces of the next division; none where the search has ended."""
+        """Return the pieces of the next division; none where the search has ended."""
         return next(self._divisions, [])
 
     def judge(self, fits: Sequence[Fit]) -> None:
@@ -145,7 +145,7 @@ class Search:
 
 
 def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
-    """Labels (h, w) from 1 of the pieces of an object, 0 beside it, in its window."""
+    """Yield label images (h, w) in the window of an object: its pieces from 1, 0 beside it."""
     depth = np.where(np.isfinite(obj.depth_crop), obj.depth_crop, np.float32(0))
     labels = (obj.mask_crop & (depth > 0)).astype(np.int32)
     extent = regions.extents(labels)[1]
@@ -177,7 +177,7 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
 
 
 def _make_objects(obj: SeenObject, depth: np.ndarray, camera: Camera, pieces: np.ndarray) -> Iterator[SeenObject]:
-    """The pieces of an object, in its window, as objects that stand on what it stands on."""
+    """Make objects of the pieces of an object, in its window; they stand on what it stands on."""
     for k in range(1, int(pieces.max()) + 1):
         mask = np.zeros_like(obj.mask)
         mask[obj.window] = pieces == k

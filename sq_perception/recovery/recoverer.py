@@ -346,7 +346,7 @@ class Recoverer:
         network: Network | None,
         deadline: float,
     ) -> list[Parts | None]:
-        """The parts of each object; None where one body explains it, or parts are not asked for."""
+        """Find the parts of each object; None where one body explains it, or parts are not asked for."""
         camera, options = readings.camera, readings.options
         if not options.parts or options.method not in ("auto", "symmetry"):
             return [None] * len(objects)
