@@ -139,7 +139,7 @@ class Outputs:
             )
         if shown.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
             self.support_plane.publish(plane_message(shown.plane, shown.header))
-        self.superquadrics.publish(to_message(shown.array, shown.header))
+        self.superquadrics.publish(to_message(shown.cloud, shown.header))
 
     def accompany(
         self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters, stages: dict[str, float]

@@ -183,6 +183,9 @@ class RecoverParameters(Parameters):
     repair: bool = setting(
         True, "Split, join and drop own segments with a network; exclude readings of neighbours from fits."
     )
+    parts: bool = setting(
+        False, "Also recover the parts of objects that one body does not explain (see docs/points.md)."
+    )
 
     @property
     def box(self) -> Box | None:
@@ -203,6 +206,7 @@ class RecoverParameters(Parameters):
             free_space=has_free_space,
             time_budget=self.time_budget or math.inf,
             repair=self.repair,
+            parts=self.parts,
         )
 
     def __post_init__(self) -> None:
