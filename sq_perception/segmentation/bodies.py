@@ -79,7 +79,7 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
     if np.count_nonzero(left) < least:
         return labels
     # A side that is seen at a grazing angle has steps all over, but all one way.
-    steep = _large(depth_steps.separated(depth, left, _GAP), least)
+    steep = _large(depth_steps.separate(depth, left, _GAP), least)
     return np.where(steep > 0, steep + labels.max(), labels)
 
 
