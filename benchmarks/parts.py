@@ -109,7 +109,9 @@ def covered_sizes(
             axes = fit.superquadric.rotation_matrix.T
             whole = (solid.support(axes) + solid.support(-axes)) / 2
             points = solid.sample_surface(1000, np.random.default_rng(0))
-            buried = np.any([other.gauge(points) <= 1 for j, other in enumerate(solids) if j != k], axis=0)
+            buried = np.zeros(len(points), bool)
+            for other in (*solids[:k], *solids[k + 1 :]):
+                buried |= other.gauge(points) <= 1
             bare = np.ptp(points[~buried] @ axes.T, axis=0) / 2
             half = (fit.superquadric.support(axes) + fit.superquadric.support(-axes)) / 2
             off = np.maximum(np.maximum(bare - half, half - whole), 0)
