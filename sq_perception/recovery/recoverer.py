@@ -353,7 +353,7 @@ class Recoverer:
         config = None if network is None else network.config
         searches = self._mapped(lambda k: parts.Search(objects[k], fits[k], depth, camera), range(len(objects)))
         divided = self._mapped(parts.Search.next_pieces, searches)
-        while any(divided):
+        while any(divided) and time.perf_counter() < deadline:
             pieces = [piece for some in divided for piece in some]
             pieces = self._mapped(lambda each: seen_object.viewed(each, depth, camera, config), pieces)
             if network is not None:
