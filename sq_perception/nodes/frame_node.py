@@ -267,7 +267,7 @@ class FrameNode(ManagedNode):
         return tuple(turn.tolist()), tuple(shift.tolist())
 
     def _found_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
-        """The pose of a header's frame in that of the parameter ``name``; ValueError if it is not known.
+        """Return the pose of a header's frame in that of the parameter ``name``; ValueError if it is unknown.
 
         A transform that has not come yet is waited for while other cameras compute.
         """

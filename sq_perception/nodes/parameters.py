@@ -147,8 +147,8 @@ class RecoverParameters(Parameters):
     )
     camera_frame: str = setting(
         "",
-        "tf2 frame, optical, of the camera that took the points (image_transport: points), where they come in another "
-        "one. Empty: that of the points.",
+        "Optical tf2 frame of the camera that took the points (image_transport: points), if they are in another frame. "
+        "Empty: the points' frame.",
     )
     tf_tolerance: float = setting(
         0.1,

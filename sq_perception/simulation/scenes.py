@@ -150,8 +150,7 @@ def turn_about_up(yaw: float) -> np.ndarray:
 def resting_body(
     rng: np.random.Generator, plane: np.ndarray, reach: float = _PLACE_RADIUS
 ) -> tuple[Superquadric, float]:
-    """A random body that touches the plane within ``reach`` metres of where the camera looks, and the radius, metres,
-    of the ball about its centre that holds it."""
+    """Draw a body on the plane within ``reach`` metres of where the camera looks, and its bounding radius, metres."""
     normal, offset = plane[:3], plane[3]
     size, shape = rng.uniform(*_TABLE_SIZE, 3), rng.uniform(*_TABLE_SHAPE, 2)
     upright = int(rng.integers(3)) if shape.max() < _FLAT_BELOW else int(np.argmin(size))
