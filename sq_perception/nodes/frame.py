@@ -30,7 +30,7 @@ from sq_perception.recordings.cloud_frame import moved
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
-"""Decimals of pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
+"""Decimals of pixels to which a cloud's camera is rounded, so that noise does not change it between frames."""
 
 
 def newest() -> QoSProfile:

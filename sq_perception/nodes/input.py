@@ -40,8 +40,8 @@ from sq_perception.recordings.publication import size_of
 _INFOS = 16
 _MASKS = 8
 _WAITING = 64
-"""Images that wait for their companions at the same time; beyond them the oldest one's patience is at an end.  Dropped
-instead it would be again and again, and a camera that sends so many within ``patience`` be answered never."""
+"""Images that wait for camera_info or mask at the same time; beyond them the oldest stops waiting. If it were dropped
+instead, a camera that sends so many within ``patience`` would never get an answer."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Input:
         self._numbers_note: tuple[str, ...] = ()
         self._last_image = monotonic()
         self._changed = threading.Condition()
-        """Guards what follows."""
+        """Guards the following attributes."""
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=_INFOS)

@@ -14,7 +14,7 @@ from sq_msgs_py.message_types import installed
 from sq_perception.recordings.publication import Findings
 
 Outcomes = Callable[[], Awaitable[tuple[bool, str, Findings | None]]]
-"""Recovers the next image: success, summary or reason, and what was found."""
+"""Recovers the next image: success, summary or reason, and the bodies."""
 
 
 def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any, **more: Any) -> Any:

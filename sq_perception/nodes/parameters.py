@@ -24,7 +24,7 @@ RAW, POINTS = "raw", "points"
 """Plain images, and clouds of points, as image_transport names them."""
 EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
 _KEEPS_ALL = 100.0
-"""Metres: the value of depth_max that leaves nothing out."""
+"""Metres: the value of depth_max that keeps all readings."""
 
 
 def _check_box(name: str, box: tuple[float, ...]) -> None:

@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
-"""Threads that spin while they wait take the cores from the nodes beside them: on two busy cores a frame took 30 ms
-with these settings and 50 to 150 ms without.  Small solves and small images gain nothing from a second thread: OpenCV's
-took a tenth of the processor time of a VGA frame of one body, and made it 2 % faster on an idle core."""
+"""Spinning threads take cores from other nodes: on two busy cores a frame took 30 ms with these settings and 50 to 150
+ms without. Small solves and images gain nothing from a second thread: OpenCV's took a tenth of the processor time of a
+VGA frame of one body, and saved 2 % on an idle core."""
 _M_ARENA_MAX, _HEAPS = -8, 2
-"""The option of glibc's malloc.h, and how many heaps a process gets: with one, threads waited for each other, and a
-frame took 10 % more processor time; with two, it took what it takes with one for each thread."""
+"""The option of glibc's malloc.h, and the number of heaps: with one, threads waited for each other and a frame took 10
+% more processor time; with two it took the same as with one per thread."""
 _LOOK = 0.1
-"""Seconds between two looks at whether a signal has arrived."""
+"""Seconds between two checks for a signal."""
 
 
 _Node = TypeVar("_Node", bound="Stoppable")
 REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-"""Where rclpy is not there."""
+"""Advice if rclpy is missing."""
 
 
 class Stoppable(Protocol):
     """An rclpy node that may fail to start, and must be stopped before it is destroyed."""
 
     start_failure: str
-    """Why the node cannot start, once it has found out; its process then ends."""
+    """Why the node cannot start, once known; its process then ends."""
 
     def close(self) -> bool:
         """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""
