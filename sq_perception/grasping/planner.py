@@ -93,13 +93,13 @@ def grasps(
     bodies : Superquadric
         A NumPy batch (n,), all in one frame.
     covariance : (n, 11, 11), optional
-        As in :class:`sq_perception.fitting.fit.Fit`; what is not finite in it is taken for known to 10 %.
+        As in :class:`sq_perception.fitting.fit.Fit`; a value that is not finite counts as 10 % sigma.
     around
-        Table, measured points and what was seen; nothing but the bodies if not given.
+        Table, measured points and unseen space; only the bodies if not given.
     friction
-        mu between pads and bodies at the least: the cone of friction is that of mu to twice mu, weights count on mu.
+        Smallest mu between pads and bodies: the friction cone is that of mu to twice mu, weights assume mu.
     placement
-        Standard deviation of where the hand comes to be, metres along each axis: calibration of arm and camera.
+        Standard deviation of the hand's position along each axis, metres: calibration of arm and camera.
 
     Raises
     ------

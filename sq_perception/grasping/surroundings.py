@@ -35,8 +35,8 @@ class Surroundings:
     points : (j, 3)
         Measured points of objects; the table's are not among them.
     depth, camera
-        A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical
-        one: what lies behind what it shows has not been seen.
+        A depth image in metres, NaN for no reading, and its pinhole camera, if the frame is the optical one: space
+        behind its surfaces is unseen.
 
     Raises
     ------

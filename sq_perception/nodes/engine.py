@@ -204,7 +204,7 @@ class Engine:
 def _make(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
     """Return a warm recoverer, with the weights of ``kept`` if given; an existing one if it is equivalent.
 
-    None if nobody wants it any more.
+    None if it is no longer wanted.
     """
     weights = _file(parameters.model) if kept is None else kept.weights
     # Without the model: the same file may have several names.

@@ -48,8 +48,8 @@ instead, a camera that sends so many within ``patience`` would never get an answ
 class Arrival:
     """A depth image with its camera_info and mask.
 
-    Its size is None for what is no image, which is to be refused at once.  It came at a time and waits for its
-    companions until a deadline, seconds of the monotonic clock.
+    ``size`` is None for a message that is no image and is refused at once.  ``time`` is its arrival, ``deadline`` the
+    end of its wait for camera_info and mask, seconds of the monotonic clock.
     """
 
     message: DepthMessage

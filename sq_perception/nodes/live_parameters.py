@@ -61,11 +61,11 @@ class LiveParameters(Generic[P]):
     Parameters
     ----------
     locked
-        Why what is not live cannot change now; empty where it can.  None: it never can.
+        Returns why parameters that are not live cannot change now; empty if they can.  None: they never can.
     check
-        Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
+        Raises ValueError for an invalid set of values; also gets the names of those that change.
     changed
-        Called with the new values and which of them were set.
+        Called with the new values and the names of those that were set.
     defaults
         Of this node, in place of the dataclass'.
 

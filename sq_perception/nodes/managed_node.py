@@ -92,7 +92,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def start(self, autostart: bool = True) -> None:
         """Configure and activate, now and after a fault; :attr:`start_failure` holds the reason of a failure.
 
-        Without ``autostart`` only say that somebody else has to.
+        Without ``autostart`` only log that a manager must do so.
         """
         if not autostart:
             self.get_logger().info(

@@ -63,8 +63,8 @@ class Stoppable(Protocol):
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
     """Create nodes and spin them until they are asked to stop; return the exit code.
 
-    ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
-    Nodes that it has yielded are closed also where a later one cannot be made.
+    ``create`` imports what the nodes need, so that this function handles signals during the seconds of imports.  Nodes
+    that it has yielded are closed even if a later one cannot be made.
     """
     if importlib.util.find_spec("rclpy") is None:
         print(f"{name} needs ROS 2 in Python: {REMEDY}", file=sys.stderr)
@@ -123,8 +123,8 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
 def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
     """Create a node of this class.
 
-    Where it cannot be made, what is there of it is destroyed before the error goes on: the memory that it shares with
-    other processes would outlive this one, and a launch file tries again and again.
+    If that fails, the unfinished node is destroyed before the error is raised: its shared memory would outlive this
+    process, and a launch file tries again and again.
     """
     node = kind.__new__(kind)
     try:
