@@ -17,7 +17,7 @@ from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.recovery.recovery import edges_as_text, place_as_text
 
 _AXES = re.compile(" along [xyz]( and [xyz])*")
-"""Which ones they are, the deviations show."""
+"""Names of axes, which the deviations show anyway."""
 
 
 def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:

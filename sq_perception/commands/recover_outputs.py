@@ -55,7 +55,7 @@ _DECISIVE = (
     "max_objects",
     "parts",
 )
-"""Options that decide what is found in a frame."""
+"""Options that affect the results."""
 
 
 def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:

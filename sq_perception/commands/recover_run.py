@@ -62,7 +62,7 @@ class RecoverRun:
     Attributes
     ----------
     outputs : Outputs
-        Where what was recovered goes.
+        The outputs of the run.
     is_whole : bool
         Whether all frames were tried.
 

@@ -55,7 +55,7 @@ Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_
 Frames are computed in turn: one process per camera would load the network several times and compete for the cores.""",
 }
 _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-"""Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
+"""Checked here too, since rclpy checks it only while it makes a node, and complains of the unfinished node."""
 
 
 def _run(name: str, arguments: Sequence[str] | None = None) -> int:

@@ -97,7 +97,7 @@ class ThingsOnTable:
     depth : float64 (height, width)
         +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
     labels : int32 (height, width)
-        True masks, 0 for what is no object.
+        True masks, 0 for no object.
     plane : (4,)
         Height above the table = n.p + d.
     table : (3, 3)
@@ -160,7 +160,7 @@ def things_on_table(
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 8, the camera is no pinhole, or the objects find no room in its image.
+        If ``count`` is not 1 to 8, the camera is no pinhole camera, or the objects do not fit into its image.
     """
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
