@@ -91,7 +91,7 @@ class Surroundings:
         _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
         if len(kept) > _MOST:
             kept = kept[np.linspace(0, len(kept) - 1, _MOST).astype(int)]
-        return cls(plane, points[kept], hole_filling.filled(z)[0], camera)
+        return cls(plane, points[kept], hole_filling.fill(z)[0], camera)
 
     def down(self, places: np.ndarray) -> np.ndarray:
         """Return unit vectors (k, 3) downwards at places (k, 3): to the plane, or away from the frame's origin."""

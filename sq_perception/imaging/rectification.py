@@ -164,7 +164,7 @@ class Lookup:
         nearest = self._nearest(image, np.nan)
         # Warnings for pixels without depth only.
         with np.errstate(divide="ignore", invalid="ignore"):
-            bridged, _, _ = hole_filling.filled(image)
+            bridged, _, _ = hole_filling.fill(image)
             inverse = cv2.patchNaNs(1 / bridged, 0)
             closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, depth_steps.CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)

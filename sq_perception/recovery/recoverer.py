@@ -187,7 +187,7 @@ class Recoverer:
         self.recover(image, camera, (index >= 0).astype(np.int32))
         self.recover(image, camera)
         image[::2] = np.nan
-        hole_filling.filled(image)
+        hole_filling.fill(image)
 
     def recover(
         self,
@@ -229,7 +229,7 @@ class Recoverer:
         began = time.perf_counter()
         measured = _measure(camera.readings(depth), camera)
         labels = None if labels is None else _masks(labels, measured)
-        measured, labels, closed = hole_filling.filled(measured, labels)
+        measured, labels, closed = hole_filling.fill(measured, labels)
         return Readings(measured, closed, camera, labels, options or self._options, began)
 
     def find_objects(self, readings: Readings, segmentation: segments.Segmentation | None = None) -> Found:

@@ -51,7 +51,7 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
     measured = _readings(depth[row, column].astype(float), camera)
     if (inside & ~np.isfinite(measured)).any():  # perhaps a gap between readings of one surface
-        measured = hole_filling.filled(_readings(depth, camera))[0][row, column].astype(float)
+        measured = hole_filling.fill(_readings(depth, camera))[0][row, column].astype(float)
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
     behind = np.where(inside & np.isfinite(measured), measured, -np.inf) - points[..., 2]
     clear, observed = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)

@@ -21,7 +21,7 @@ PATTERNS = {
 @pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
 def test_gaps_take_the_nearest_reading_and_its_label(pattern: np.ndarray) -> None:
     labels = np.where(pattern, 9, ROWS // 4 + 1)
-    filled, named, gaps = hole_filling.filled(np.where(pattern, np.float32(np.nan), SLOPE), labels)
+    filled, named, gaps = hole_filling.fill(np.where(pattern, np.float32(np.nan), SLOPE), labels)
     inside = np.s_[2:-4, 2:-4]
     rows, columns = np.nonzero(~pattern)
     away = np.hypot(ROWS[inside][..., None] - rows, COLUMNS[inside][..., None] - columns)
@@ -36,7 +36,7 @@ def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
     image = np.where(PATTERNS["every second line"], np.float32(np.nan), SLOPE)
     image[8:15, 8:15] = np.nan
     given, labels = image.copy(), ROWS // 4
-    filled, named, _ = hole_filling.filled(image, labels)
+    filled, named, _ = hole_filling.fill(image, labels)
     assert np.isnan(filled[9:14, 9:14]).all()
     assert np.isfinite(filled[:, :8]).all()
     assert named is not labels
@@ -46,11 +46,11 @@ def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
 
 def test_single_gaps_as_of_recorded_frames_stay() -> None:
     image = np.where((ROWS % 8 == 3) & (COLUMNS % 8 == 2), np.float32(np.nan), SLOPE)
-    assert hole_filling.filled(image) == (image, None, None)
+    assert hole_filling.fill(image) == (image, None, None)
 
 
 def test_an_image_without_gaps_is_given_back() -> None:
-    assert hole_filling.filled(SLOPE) == (SLOPE, None, None)
+    assert hole_filling.fill(SLOPE) == (SLOPE, None, None)
 
 
 @pytest.mark.parametrize("masks", ["given", "own"])
