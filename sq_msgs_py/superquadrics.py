@@ -30,11 +30,12 @@ sigma_c1..c3    standard deviations of the centre along the body's axes x y z, m
 sigma_r1..r3    standard deviations of the rotation about the body's axes x y z, radians
 kx ky           tapers, -0.95 to 0.95; 0 for none
 objectness      probability that the object is a thing, and no piece of its support or of furniture; 1 for given masks
+part            0 for an object's body; 1, 2 ... for its parts, which share its id, label and seen, and have no score
 
-All are float32 but id, status, label, seen, fused and reason, which are uint32.  Deviations are NaN where unknown.  The
-header copies stamp and frame of the depth image.  Readers find fields by name: a later version may append fields, and
-raises VERSION when it changes the meaning of one.  What follows status was appended after 0.2.0; in a cloud without it
-integers and tapers are 0 and deviations NaN.
+All are float32 but id, status, label, seen, fused, reason and part, which are uint32.  Deviations are NaN where
+unknown.  The header copies stamp and frame of the depth image.  Readers find fields by name: a later version may append
+fields, and raises VERSION when it changes the meaning of one.  What follows status was appended after 0.2.0; in a cloud
+without it integers and tapers are 0 and deviations NaN.
 
 The eight parameter vectors of one body (half turns about the axes, quarter turns about z with a1 and a2 exchanged) are
 equally right: compare bodies, never raw parameters.
@@ -80,7 +81,7 @@ FIELDS: tuple[tuple[str, int], ...] = tuple(
     )
 ) + tuple((name, UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
 FIELDS += tuple((f"sigma_{name}", FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
-FIELDS += (("kx", FLOAT32), ("ky", FLOAT32), ("objectness", FLOAT32))
+FIELDS += (("kx", FLOAT32), ("ky", FLOAT32), ("objectness", FLOAT32), ("part", UINT32))
 """Name and PointField datatype of every field, in the order of the message."""
 
 _NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index("label")])
@@ -109,6 +110,8 @@ class SuperquadricArray(Columns):
         0 if not given.
     objectness : (n,) float32
         NaN if not given.
+    part : (n,) uint32
+        0 if not given.
 
     Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
     """
@@ -136,11 +139,21 @@ class SuperquadricArray(Columns):
         metadata=column("kx", "ky", missing=0.0),
     )
     objectness: np.ndarray | None = field(default=None, metadata=column("objectness"))
+    part: np.ndarray = field(default=None, metadata=column("part"))  # type: ignore[arg-type]
+
+    def parts_of(self, number: int) -> SuperquadricArray:
+        """Return the parts of the object with this id; none where it is one body."""
+        return self.where((self.part > 0) & (self.id == number))
+
+    def followed_by(self, other: SuperquadricArray) -> SuperquadricArray:
+        """Join the rows of this array and those of another one."""
+        columns = {each.name: (getattr(self, each.name), getattr(other, each.name)) for each in fields(self)}
+        return replace(self, **{name: np.concatenate(both) for name, both in columns.items()})
 
     @property
     def recovered(self) -> SuperquadricArray:
-        """Those that did not fail, in their order."""
-        return self.where(self.status != FAILED)
+        """The bodies of objects that did not fail, in their order, without parts."""
+        return self.where((self.status != FAILED) & (self.part == 0))
 
     def where(self, kept: np.ndarray) -> SuperquadricArray:
         """Those of a mask (n,), in their order."""

@@ -34,7 +34,7 @@ _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score", "weakest"
 _SHARP = 0.02
 """Exponents of a gripper's boxes in a mesh."""
 _LONGEST = 10.0
-"""Most that a side of a picture is longer than the other."""
+"""Largest aspect ratio of a picture."""
 
 
 def run(options: argparse.Namespace) -> int:

@@ -157,6 +157,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     add("--track", action="store_true", help="track bodies over the frames of each bag or folder, see below")
     add("--poses", type=Path, metavar="FILE", help="camera poses of frames that show one scene, see below")
+    add("--parts", action="store_true", help="also recover the parts of objects that one body does not explain")
     add(
         "--time-budget",
         type=positive,

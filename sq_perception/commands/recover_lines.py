@@ -17,7 +17,7 @@ from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.recovery.recovery import edges_as_text, place_as_text
 
 _AXES = re.compile(" along [xyz]( and [xyz])*")
-"""Which ones they are, the deviations show."""
+"""Names of axes, which the deviations show anyway."""
 
 
 def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
@@ -31,6 +31,10 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
             yield "  " + ", ".join(f"{stage} {value:.0f} ms" for stage, value in entry["ms_by_stage"].items())
         for number, body in enumerate(entry["superquadrics"]):
             yield "  " + _line(number, body, entry["coordinates"] == "cube")
+            for part in body.get("parts", ()):
+                edges = edges_as_text(part["size"], _sigmas(part), False)
+                place = place_as_text(part["translation"], False)
+                yield f"    part {part['share']:.0%} {part['status']} {edges} at {place}"
             if verbose:
                 yield "    " + _details(body)
             elif body["status"] != "converged":
@@ -53,14 +57,17 @@ def _line(number: int, body: Mapping[str, Any], is_cube: bool) -> str:
     if CUT_SHORT in body["message"]:
         parts.append(f"({CUT_SHORT})")
     if body["status"] != "failed":
-        sigma = [math.nan if value is None else value for value in body["sigma_size"]]
-        parts.append(edges_as_text(body["size"], sigma, is_cube))
+        parts.append(edges_as_text(body["size"], _sigmas(body), is_cube))
     parts.append(f"at {place_as_text(body['translation'], is_cube)}")
     if body["label"] is not None:
         parts.append(f" mask {body['label']}")
     if body["track"] is not None:
         parts.append(f" id {body['track']['id']}")
     return " ".join(parts)
+
+
+def _sigmas(body: Mapping[str, Any]) -> list[float]:
+    return [math.nan if value is None else value for value in body["sigma_size"]]
 
 
 def _details(body: Mapping[str, Any]) -> str:

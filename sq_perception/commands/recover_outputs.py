@@ -53,8 +53,9 @@ _DECISIVE = (
     "poses",
     "time_budget",
     "max_objects",
+    "parts",
 )
-"""Options that decide what is found in a frame."""
+"""Options that affect the results."""
 
 
 def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
@@ -257,18 +258,28 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    """Write the bodies of a frame; no file if there are none."""
-    shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
+    """Write the bodies of a frame, or their parts; no file if there are none."""
+    shown = [
+        (k, name, solid)
+        for k, body in enumerate(recovery.bodies)
+        if body.status != Status.FAILED
+        for name, solid in zip(_names(k, len(body.solids)), body.solids, strict=True)
+    ]
     if not shown:
         return
     with output_file.writing(path) as partial:
         mesh.export(
-            [in_result_frame(recovery.bodies[k].superquadric, frame.is_cube) for k in shown],
+            [in_result_frame(solid, frame.is_cube) for _, _, solid in shown],
             partial,
-            colours=mesh.COLOURS[[k % len(mesh.COLOURS) for k in shown]],
-            names=[f"body_{k}" for k in shown],
+            colours=mesh.COLOURS[[k % len(mesh.COLOURS) for k, _, _ in shown]],
+            names=[name for _, name, _ in shown],
             optical=not frame.is_cube,
         )
+
+
+def _names(number: int, count: int) -> list[str]:
+    """``body_3``, or ``body_3_part_1`` ... where it has parts."""
+    return [f"body_{number}"] if count == 1 else [f"body_{number}_part_{k}" for k in range(1, count + 1)]
 
 
 def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, options: argparse.Namespace) -> None:

@@ -62,7 +62,7 @@ class RecoverRun:
     Attributes
     ----------
     outputs : Outputs
-        Where what was recovered goes.
+        The outputs of the run.
     is_whole : bool
         Whether all frames were tried.
 
@@ -83,6 +83,7 @@ class RecoverRun:
             time_budget=options.time_budget,
             max_size=options.max_size,
             workspace=None if options.workspace is None else tuple(options.workspace),
+            parts=options.parts,
         )
         done = result_json.Recovered()
         wanted = InputOptions(

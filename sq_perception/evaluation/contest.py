@@ -106,7 +106,7 @@ def network(path: Path, name: str | None = None) -> Contestant:
         raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
     # Headers without a loss are of the time when there was one only.
     loss = str(training.get("loss", "occupancy")) if training else ""
-    parts = [f"network alone, loss {loss or 'not in the file'}"]
+    parts = [f"network alone, mean of four positions of a view, loss {loss or 'not in the file'}"]
     parts.append(f"views of {model.config.pixels} x {model.config.pixels}")
     if "step" in metrics:
         parts.append(f"{metrics['step']} steps in its last training")

@@ -21,17 +21,14 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sq_perception.fitting import point_cost, points
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Parts
 from sq_perception.fitting.point_cloud import UnitCloud
 from sq_perception.fitting.point_cost import Cloud, Course, Mixture, Prior
-from sq_perception.geometry.signed_distance import signed_distance
-from sq_perception.geometry.superquadric import Superquadric
 
 MOST_PARTS = 6
 _POINTS, _PROBES = 800, 800
@@ -48,53 +45,6 @@ _CLUSTER = 0.5
 """Radius of a group of points that no body explains."""
 _QUICK, _THOROUGH = 8, 30
 """Rounds of a candidate, and of the union that goes on."""
-
-
-@dataclass(frozen=True, eq=False)
-class Parts:
-    """An object as a union of superquadrics.
-
-    Attributes
-    ----------
-    fits
-        The parts, the one with the most points first, each with its covariance, status and reason.
-    shares : (k,)
-        Share of the points that each explains.
-    status, message
-        How far the whole can be trusted, and why: that of the parts with a tenth of the points or more.
-    noise
-        Standard deviation of the points about the union, metres.
-    milliseconds
-        What it cost.
-    """
-
-    fits: tuple[Fit, ...]
-    shares: np.ndarray
-    status: Status
-    message: str
-    noise: float
-    milliseconds: float
-
-    @property
-    def superquadrics(self) -> Superquadric:
-        """The parts as a batch (k,)."""
-        return Superquadric.stack([fit.superquadric for fit in self.fits])
-
-    def __len__(self) -> int:
-        return len(self.fits)
-
-    def __iter__(self) -> Iterator[Fit]:
-        return iter(self.fits)
-
-    def contains(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3) are in one of the parts, (n,)."""
-        return np.asarray((self.superquadrics.gauge(np.asarray(points, dtype=float)[None]) <= 1).any(axis=0))
-
-    def signed_distance(self, points: np.ndarray, k_sigma: float = 0.0, *, gradient: bool = False) -> Any:
-        """As :meth:`Fit.signed_distance`, of the nearest part."""
-        covariances = np.stack([fit.covariance for fit in self.fits])
-        found = signed_distance(self.superquadrics, points, covariances, k_sigma)
-        return found if gradient else found[0]
 
 
 def decompose(
@@ -271,10 +221,5 @@ def _assessed(cloud: UnitCloud, mixture: Mixture, began: float) -> Parts:
     surface = cloud.surface()
     none = np.zeros((len(cloud.points), len(mixture.bodies)))
     shares = point_cost.shares(surface, mixture, none)[0].mean(axis=0)
-    order = np.argsort(-shares, kind="stable")
-    mixture = mixture._replace(bodies=mixture.bodies[order], turns=mixture.turns[order])
-    fits = tuple(points.assessed(cloud, mixture, k, began) for k in range(len(order)))
-    shares = shares[order]
-    worst = max((fit for fit, share in zip(fits, shares, strict=True) if share >= 0.1), key=lambda fit: fit.status)
-    milliseconds = (time.perf_counter() - began) * 1e3
-    return Parts(fits, shares, worst.status, worst.message, mixture.sigma * cloud.scale, milliseconds)
+    fits = [points.assessed(cloud, mixture, k, began) for k in range(len(shares))]
+    return Parts.of(fits, shares, mixture.sigma * cloud.scale, (time.perf_counter() - began) * 1e3)

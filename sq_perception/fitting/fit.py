@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
@@ -15,6 +16,8 @@ INLIER = 3.0
 """Noise levels up to which a pixel is an inlier: noise alone stays within for 99.7 % of the pixels."""
 FAILED_SHARE = 0.25
 """Share of the smallest half size: a body that half of the points miss by more describes none of its faces."""
+_COUNTED = 0.1
+"""Share of an object from which on a part counts towards the status of the whole."""
 CUT_SHORT = "cut short by the time budget"
 """Part of the message of a fit that the time budget ended before it was done."""
 
@@ -91,4 +94,62 @@ class Fit:
         from sq_perception.geometry.signed_distance import signed_distance  # here: a status alone compiles nothing
 
         found = signed_distance(self.superquadric, points, self.covariance, k_sigma)
+        return found if gradient else found[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """An object as a union of superquadrics.
+
+    Attributes
+    ----------
+    fits
+        The parts, the one with the most points first, each with its covariance, status and reason.
+    shares : (k,)
+        Share of the points, or of the object's pixels, that each explains.
+    status, message
+        How far the whole can be trusted, and why: that of the parts with a tenth of the points or more.
+    noise
+        Standard deviation of the points about the union, metres.
+    milliseconds
+        What it cost.
+    """
+
+    fits: tuple[Fit, ...]
+    shares: np.ndarray
+    status: Status
+    message: str
+    noise: float
+    milliseconds: float
+
+    @classmethod
+    def of(cls, fits: Sequence[Fit], shares: np.ndarray, noise: float, milliseconds: float) -> Parts:
+        """Parts in order of their shares, with the status of the worst that has a tenth or more."""
+        order = np.argsort(-shares, kind="stable")
+        sorted_fits, shares = tuple(fits[k] for k in order), shares[order]
+        counted = [fit for fit, share in zip(sorted_fits, shares, strict=True) if share >= _COUNTED] or sorted_fits[:1]
+        worst = max(counted, key=lambda fit: fit.status)
+        return cls(sorted_fits, shares, worst.status, worst.message, noise, milliseconds)
+
+    @property
+    def superquadrics(self) -> Superquadric:
+        """The parts as a batch (k,)."""
+        return Superquadric.stack([fit.superquadric for fit in self.fits])
+
+    def __len__(self) -> int:
+        return len(self.fits)
+
+    def __iter__(self) -> Iterator[Fit]:
+        return iter(self.fits)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (n, 3) are in one of the parts, (n,)."""
+        return np.asarray((self.superquadrics.gauge(np.asarray(points, dtype=float)[None]) <= 1).any(axis=0))
+
+    def signed_distance(self, points: np.ndarray, k_sigma: float = 0.0, *, gradient: bool = False) -> Any:
+        """As :meth:`Fit.signed_distance`, of the nearest part."""
+        covariances = np.stack([fit.covariance for fit in self.fits])
+        from sq_perception.geometry.signed_distance import signed_distance  # here: as above
+
+        found = signed_distance(self.superquadrics, points, covariances, k_sigma)
         return found if gradient else found[0]

@@ -23,15 +23,15 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
 
 _TOO_WIDE = 0.8
-"""Sigmas of a body's width by which it may exceed the opening: beyond, it would fit less than once in five times."""
+"""Sigmas of a body's width by which it may exceed the opening: beyond, it fits less than once in five times."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
-"""Turns of the approach about the closing line, away from the steepest one."""
+"""Rotations of the approach about the closing line, from the steepest one."""
 _STEEP = 0.3
-"""Sine of the least angle of a closing line to the vertical."""
+"""Sine of the smallest angle between closing line and vertical."""
 _SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
-"""Slides along the third axis, as shares of the way to where the finger's width is no longer wholly on the body."""
+"""Slides along the third axis, as shares of the distance at which the finger's width leaves the body."""
 _ABOVE_TABLE = 0.004
-"""Height above the table that a gripper keeps at its deepest, metres."""
+"""Smallest height of a gripper above the table, metres."""
 _ENGAGED = 0.012
 """Length of finger beyond the near end in a shallow grasp, metres."""
 

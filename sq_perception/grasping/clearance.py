@@ -23,9 +23,9 @@ from sq_perception.geometry.kernels import inline_kernel, kernel, support
 FAR, NEAR = 0.05, 0.02
 """Largest gap to a body and distance to a point, metres; larger ones are cut off, as nothing depends on them."""
 _CELL = 0.03
-"""Side of the cubes by which points are passed over, metres."""
+"""Side of the cubes that group points, metres."""
 _STRAY = 3
-"""Nearest points that do not count for a gap: flying pixels."""
+"""Number of nearest points that are ignored as flying pixels."""
 
 
 @kernel

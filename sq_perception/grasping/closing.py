@@ -28,11 +28,11 @@ from sq_perception.geometry.kernels import gauge_derivatives, kernel, support_de
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
 UNKNOWN = 0.1
-"""Standard deviation, as a share of a half size, where a body comes without one."""
+"""Default standard deviation, as a share of a half size."""
 _STEP = np.pi / 12
 _NEWTON_STEPS = 4
 _GRAZING = 1e-12
-"""Slope of the gauge, per metre, up to which a line does not leave a body."""
+"""Slope of the gauge, per metre, below which a line does not leave a body."""
 _KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
 """Rows of the covariance without the exponents."""
 

@@ -23,7 +23,7 @@ _QUARTER_TURN = (0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))
 _QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 _BOX_FACES = np.array([corners for a, b, c, d in _QUADS for corners in ((a, b, c), (a, c, d))])
 _REACH = 0.1
-"""Length over which the approach is straight, metres."""
+"""Length of the straight approach, metres."""
 
 
 def _are_numbers(value: object, shape: tuple[int, ...]) -> bool:

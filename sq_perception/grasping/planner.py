@@ -59,21 +59,21 @@ from sq_perception.grasping.trials import (
 from sq_perception.imaging.camera import Camera
 
 FRICTION = 0.5
-"""Coefficient of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
+"""Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
 _AT_MOST = 2.0
-"""Most friction, in multiples of the least."""
+"""Largest friction, as a multiple of the smallest."""
 PER_BODY = 8
-"""Grasps a body that are returned at most."""
+"""Maximum number of grasps returned per body."""
 PLACEMENT = 0.002
-"""Metres, standard deviation along each axis of where the hand comes to be: a careful calibration of camera and arm."""
+"""Standard deviation of the hand's position along each axis, metres: a careful calibration of camera and arm."""
 _SQUARE = np.deg2rad(8.0)
 """Standard deviation of normals, radians."""
 _HIDDEN = 0.15
-"""Probability that space which nobody has seen beside a body is taken."""
+"""Probability that unseen space beside a body is occupied."""
 _CHECKED, _CHECKED_CLOSELY = 200, 16
-"""Grasps a body whose distance to the other bodies is computed, and of the best of these that to measured points."""
+"""Number of grasps per body whose distance to other bodies is computed, and of the best whose distance to points is."""
 _SURE = 0.5
-"""Probability of a body's best grasp below which its rims are tried as well."""
+"""Probability of a body's best grasp below which its rims are also tried."""
 _LEAST = 0.05
 """Probability below which grasps are not returned."""
 
@@ -93,13 +93,13 @@ def grasps(
     bodies : Superquadric
         A NumPy batch (n,), all in one frame.
     covariance : (n, 11, 11), optional
-        As in :class:`sq_perception.fitting.fit.Fit`; what is not finite in it is taken for known to 10 %.
+        As in :class:`sq_perception.fitting.fit.Fit`; a value that is not finite counts as 10 % sigma.
     around
-        Table, measured points and what was seen; nothing but the bodies if not given.
+        Table, measured points and unseen space; only the bodies if not given.
     friction
-        mu between pads and bodies at the least: the cone of friction is that of mu to twice mu, weights count on mu.
+        Smallest mu between pads and bodies: the friction cone is that of mu to twice mu, weights assume mu.
     placement
-        Standard deviation of where the hand comes to be, metres along each axis: calibration of arm and camera.
+        Standard deviation of the hand's position along each axis, metres: calibration of arm and camera.
 
     Raises
     ------

@@ -41,7 +41,7 @@ _BEYOND = 0.015
 _HIGH, _THIN = 0.006, 0.012
 """Height of the rim, and its largest thickness, metres."""
 _STRAY = 3
-"""Which point of a bearing, from the highest on, is the top: flying pixels may lie above it."""
+"""Index of the point of a bearing, from the highest on, that is the top: flying pixels may be above it."""
 _UPRIGHT = 0.9
 """Share of rims that held where all other margins were sure: 31 of 35 that scenes of benchmarks/picking.py from
 seed 20000 on, none of which is reported, ended with.  In place of friction: how steep a wall is, is not looked at."""

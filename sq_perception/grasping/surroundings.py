@@ -11,17 +11,17 @@ from sq_perception.imaging import hole_filling
 from sq_perception.imaging.camera import Camera, Lens
 
 _BEHIND = 0.015
-"""Distance behind what a pixel measured, metres, from which on a place was not seen."""
+"""Distance behind a reading, metres, beyond which space is unseen."""
 _EMPTY = 0.005
-"""Distance before what a pixel measured, metres, from which on a place is empty."""
+"""Distance before a reading, metres, beyond which space is empty."""
 _NEAREST = 1e-3
-"""Least depth of a place that the image shows, metres."""
+"""Smallest depth that the image shows, metres."""
 _SPACING = 0.005
-"""Spacing of the points that are kept, metres."""
+"""Spacing of kept points, metres."""
 _MOST = 6000
-"""Most points that are kept."""
+"""Maximum number of kept points."""
 _ABOVE = 0.008
-"""Height below which points are the table's, metres."""
+"""Height below which points belong to the table, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +35,8 @@ class Surroundings:
     points : (j, 3)
         Measured points of objects; the table's are not among them.
     depth, camera
-        A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical
-        one: what lies behind what it shows has not been seen.
+        A depth image in metres, NaN for no reading, and its pinhole camera, if the frame is the optical one: space
+        behind its surfaces is unseen.
 
     Raises
     ------

@@ -10,11 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 DENSITY = 500.0
-"""Density of objects, kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
+"""Density of objects, kg/m^3, between empty and full packages; the sigma of a mass is half of it."""
 CLEARANCE = 0.005
 """Clearance on either side of the body and before the palm, metres."""
 LEAST_ENGAGED = 0.004
-"""Least length of finger beyond the near end, metres."""
+"""Smallest length of finger beyond the near end, metres."""
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
 """Standard deviation, metres, to which thinned points tell where an object's side is that the image shows a finger to
@@ -28,9 +28,9 @@ to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none
 they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
 _ACCELERATION = 9.81 + 2.0
-"""Of gravity and of the lift beside it, m/s^2."""
+"""Acceleration of gravity and of the lift, m/s^2."""
 _PAD_RADIUS = 0.006
-"""Mean arm of the friction of a pad of some 18 mm, metres."""
+"""Mean lever arm of the friction of a pad of some 18 mm, metres."""
 
 
 class Trials(NamedTuple):

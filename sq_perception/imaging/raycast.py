@@ -48,7 +48,8 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
     index = np.full((camera.height, camera.width), -1, dtype=np.int32)
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
     flat = np.ascontiguousarray(bodies.to_numbers(), dtype=float)
-    corners = np.stack(Superquadric.from_flat(flat).bounding_box(), axis=1)[:, _CORNERS, [0, 1, 2]]
+    boxes = Superquadric.from_flat(flat).untapered().bounding_box()  # closed form, and hardly larger
+    corners = np.stack(boxes, axis=1)[:, _CORNERS, [0, 1, 2]]
     _render_bodies(flat, matrices, windows(corners, camera), camera.lens, depth, index)
     return depth, index
 

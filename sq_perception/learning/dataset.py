@@ -2,15 +2,6 @@
 
 The protocol itself is in :mod:`sq_perception.simulation.scenes`; depth comes in 255 integer steps a unit, as in its
 images.
-
-Positions
----------
-A view has 8 positions, quarter turns and reflections.  Position (k, mirror) is a reflection of x, where ``mirror``, and
-then k quarter turns counter-clockwise in x and y, all about the middle (1/2, 1/2) of the view.  The image of the moved
-body is the moved image, for cropped views and for full frames alike.
-
-A mirrored image is the image of the mirrored body, which is a superquadric again: with M = diag(-1, 1, 1), M R M is a
-rotation, and the body's own symmetry takes up the second M.
 """
 
 from __future__ import annotations
@@ -23,6 +14,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning.choices import Framing
 from sq_perception.learning.disturbance import Disturbance
+from sq_perception.learning.positions import move_bodies, move_images
 from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
 from sq_perception.simulation.view_rendering import Occluder, render_views
 
@@ -100,27 +92,6 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
     for frame, body in zip(grey, unit_cube.optical_from_cube(bodies), strict=True):
         frame[:] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], np.uint8)
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
-
-
-def move_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
-    """Images (n, p, p) in positions (n,)."""
-    images = np.where(mirror[:, None, None], images[:, :, ::-1], images)
-    out = np.empty_like(images)
-    for k in range(4):
-        chosen = turns == k
-        out[chosen] = np.rot90(images[chosen], k, axes=(1, 2))
-    return out
-
-
-def move_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
-    """The bodies (n,) of those images."""
-    sign = np.where(mirror, -1.0, 1.0)
-    centred = bodies.translation - 0.5
-    centred = np.stack([sign * centred[:, 0], centred[:, 1], centred[:, 2]], axis=-1)
-    rotation = bodies.rotation * np.stack([np.ones_like(sign), sign, sign, np.ones_like(sign)], axis=-1)
-    angle = 0.5 * np.pi * turns
-    turn = np.stack([np.zeros_like(angle), np.zeros_like(angle), np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
-    return Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
 
 
 def turn_at_random(

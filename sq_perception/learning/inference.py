@@ -26,7 +26,6 @@ from sq_perception.geometry.threads import one_torch_thread
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
-from sq_perception.learning.mirror_images import predict_with_mirror
 from sq_perception.learning.network_config import (
     MaskConfig,
     RegressorConfig,
@@ -34,6 +33,7 @@ from sq_perception.learning.network_config import (
     check_views,
     mirror_planes,
 )
+from sq_perception.learning.positions import predict_in_positions
 
 if TYPE_CHECKING:
     from sq_perception.learning.thing_network import ThingNetwork
@@ -131,13 +131,13 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     """
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
-        return _BothWays(forward.CompactRegressor(config, weights))
+        return _InPositions(forward.CompactRegressor(config, weights))
     try:
         model = checkpoint.load(path, device).for_inference()
     except ModuleNotFoundError as error:
         what = f"a network of the backbone {config.backbone} on {device}"
         raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
-    return _BothWays(_OnOneThread(model) if _is_cpu(device) else model)
+    return _InPositions(_OnOneThread(model) if _is_cpu(device) else model)
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
@@ -164,15 +164,15 @@ def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
 
 
-class _BothWays:
-    """A predictor of bodies that is shown each view and its mirror image, as one batch."""
+class _InPositions:
+    """A predictor of bodies that is shown each view in four positions, as one batch."""
 
     def __init__(self, model: Predictor) -> None:
         self.config = model.config
         self._model = model
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        return predict_with_mirror(self._model.predict, check_views(views, self.config))
+        return predict_in_positions(self._model.predict, check_views(views, self.config))
 
 
 class _OnOneThread:

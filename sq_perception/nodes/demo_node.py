@@ -22,9 +22,9 @@ from sq_perception.recordings.publication import depth_of, superquadrics
 
 IMAGE, TRUTH = "depth/image", "synthetic_depth_node/truth"
 _REMEMBERED = 40
-"""Images that wait for what belongs to them."""
+"""Number of images that may wait for their truth and results."""
 _PATIENCE = 600.0
-"""Seconds until the first result: the first start compiles, for minutes on a slow machine."""
+"""Seconds to wait for the first result: the first start compiles, for minutes on a slow machine."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,9 +34,9 @@ from sq_perception.segmentation.options import Pose
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _MADE_OF = ("device", "threads", "method", "model")
-"""Parameters that a recoverer is made of."""
+"""Parameters that determine a recoverer."""
 _READ_BY = frozenset(("model", "device"))
-"""Those that, when they are set, have the weights read anew; after a change of the others the loaded ones are kept."""
+"""Parameters that reload the weights when they are set; a change of others keeps the loaded ones."""
 
 Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 """The bodies of a frame, and a value that is equal for equal origins."""
@@ -80,7 +80,7 @@ class Turns:
 
 
 TURNS = Turns()
-"""The turns of this process."""
+"""The lock of this process."""
 _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
 _making = threading.Lock()
 
@@ -102,14 +102,14 @@ class Engine:
         self._lock = threading.Lock()
         self._built: _Built | None = None
         self._last: dict[Hashable, Reference] = {}
-        """What the last frame left to the next, by its frame_id and origin."""
+        """State that the last frame leaves for the next, by its frame_id and origin."""
         self._request = 0
         self._is_to_read = False
-        """Whether weights that were asked for have not been read yet."""
+        """Whether requested weights have not been read yet."""
         self.is_making = False
-        """Whether another one is being made."""
+        """Whether another recoverer is being made."""
         self.fault = ""
-        """Why the last swap failed; empty once one has succeeded."""
+        """Why the last change failed; empty once one has succeeded."""
 
     def build(self, parameters: RecoverParameters) -> None:
         """Make and warm up the recoverer.  Raises ValueError if the model or the device cannot be used."""
@@ -204,7 +204,7 @@ class Engine:
 def _make(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
     """Return a warm recoverer, with the weights of ``kept`` if given; an existing one if it is equivalent.
 
-    None if nobody wants it any more.
+    None if it is no longer wanted.
     """
     weights = _file(parameters.model) if kept is None else kept.weights
     # Without the model: the same file may have several names.

@@ -30,14 +30,16 @@ Depth images in, superquadrics out.
 
 subscribes depth/image and depth/camera_info, or depth/points; mask/image if there are masks
 publishes  ~/superquadrics ~/markers ~/rendered_depth ~/support_plane /diagnostics
-services   ~/enable ~/trigger ~/recover, and those of a lifecycle node""",
+services   ~/enable ~/trigger ~/recover, and those of a lifecycle node
+with the package sq_msgs also ~/superquadric_array ~/recover_array and the action ~/recover_images""",
     "fitter_node": "recover_node with the classic fit of Solina and Bajcsy, with the same topics.",
     "grasp_node": """\
 Superquadrics in, grasps of a parallel gripper out.
 
 subscribes superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
 publishes  ~/grasps ~/grasp_details ~/markers /diagnostics
-services   ~/plan, ~/plan_grasps where moveit_msgs is installed, and those of a lifecycle node""",
+services   ~/plan, ~/plan_grasps where moveit_msgs is installed, and those of a lifecycle node
+with the package sq_msgs also ~/grasp_array ~/plan_array""",
     "synthetic_depth_node": """\
 A simulated depth camera, or recorded frames.
 
@@ -53,7 +55,7 @@ Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_
 Frames are computed in turn: one process per camera would load the network several times and compete for the cores.""",
 }
 _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-"""Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
+"""Checked here too, since rclpy checks it only while it makes a node, and complains of the unfinished node."""
 
 
 def _run(name: str, arguments: Sequence[str] | None = None) -> int:

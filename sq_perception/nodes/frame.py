@@ -30,7 +30,7 @@ from sq_perception.recordings.cloud_frame import moved
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
-"""Decimals of pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
+"""Decimals of pixels to which a cloud's camera is rounded, so that noise does not change it between frames."""
 
 
 def newest() -> QoSProfile:
@@ -99,13 +99,12 @@ def decode(
     Parameters
     ----------
     message
-        16UC1 or 32FC1, plain or packed; mono8 or mono16, an image of the unit cube; or points, whose camera is found
-        from them.
+        16UC1 or 32FC1, plain or compressed; mono8 or mono16, an image of the unit cube; or points, which determine the
+        camera.
     calibration_of
-        Looks up the calibration; only called for an image that is sound itself.  None for images of the unit cube, not
-        asked for clouds.
+        Looks up the calibration; only called for a valid image, not for clouds.  None for images of the unit cube.
     scale, kind
-        Units a metre, None: by the encoding; and whether the image holds "z" or "range".
+        Units per metre, None: by the encoding; and whether the image holds "z" or "range".
     view
         The camera's optical frame and the pose, quaternion and translation, of the points in it; None: they are in it.
     """
@@ -148,8 +147,8 @@ def decode(
 def image_topic(node: Node, transport: str) -> str:
     """Return the topic of depth images, with the node's namespace and remappings.
 
-    The transport's part comes behind the remapped ``depth/image``, unless that names it already.  Points have a topic
-    of their own, ``depth/points``, which is remapped by itself.
+    The transport is appended to the remapped ``depth/image``, unless that ends in it.  Points have a separate topic,
+    ``depth/points``.
     """
     if transport == POINTS:
         return str(node.resolve_topic_name("depth/points"))

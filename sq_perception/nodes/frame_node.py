@@ -50,14 +50,14 @@ from sq_perception.segmentation.options import Pose
 from sq_perception.tracking import association
 
 _WORKER_END = 3.0
-"""Seconds that a deactivation waits for the frame at hand."""
+"""Seconds that a deactivation waits for the current frame."""
 _DEFECTS = 10
-"""Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
+"""Consecutive frames that fail by a program or device error, after which the node restarts."""
 TRIGGER_TIMEOUT = 5.0
 """Seconds without a frame after which ~/trigger and ~/recover fail, beyond those that an image waits for its
 camera_info: five periods of the slowest camera in use."""
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""For timers: simulated time may stand still, and the node still has to report it."""
+"""Clock of timers: simulated time may stand still, which the node must still report."""
 
 
 class Outcome(NamedTuple):
@@ -105,10 +105,10 @@ class FrameNode(ManagedNode):
         self._worker: threading.Thread | None = None
         self._enabled = True
         self._publishing = threading.Lock()
-        """Held while something is published, or it is decided that nothing is any more."""
+        """Held while publishing, or while deciding that nothing is published any more."""
         self._defects = 0
         self._triggers: dict[Future, float] = {}
-        """Outcomes that callers of ~/trigger and ~/recover wait for, and since when."""
+        """Outcomes that callers of ~/trigger and ~/recover wait for, and the start of the wait."""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Their answers wait for a frame; in the default group nothing else would run meanwhile.
@@ -267,7 +267,7 @@ class FrameNode(ManagedNode):
         return tuple(turn.tolist()), tuple(shift.tolist())
 
     def _found_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
-        """The pose of a header's frame in that of the parameter ``name``; ValueError if it is not known.
+        """Return the pose of a header's frame in that of the parameter ``name``; ValueError if it is unknown.
 
         A transform that has not come yet is waited for while other cameras compute.
         """

@@ -64,14 +64,14 @@ class GraspNode(ManagedNode):
         self._last: PointCloud2 | None = None
         self._heard_at = monotonic()
         self._arrival = 0.0
-        """When it came, seconds of the node's clock."""
+        """Its arrival, seconds of the node's clock."""
         self._plane: PoseStamped | None = None
         self._marker_ids = MarkerIds()
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
         self._array: Publisher | None = None
         self._publishing = threading.Lock()
-        """Held while something is published, or nothing is any more."""
+        """Held while publishing, or while publishing ends."""
         self._clouds: Listener | None = None
         self._planes: Any = None
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)

@@ -40,16 +40,16 @@ from sq_perception.recordings.publication import size_of
 _INFOS = 16
 _MASKS = 8
 _WAITING = 64
-"""Images that wait for their companions at the same time; beyond them the oldest one's patience is at an end.  Dropped
-instead it would be again and again, and a camera that sends so many within ``patience`` be answered never."""
+"""Images that wait for camera_info or mask at the same time; beyond them the oldest stops waiting. If it were dropped
+instead, a camera that sends so many within ``patience`` would never get an answer."""
 
 
 @dataclass(frozen=True)
 class Arrival:
     """A depth image with its camera_info and mask.
 
-    Its size is None for what is no image, which is to be refused at once.  It came at a time and waits for its
-    companions until a deadline, seconds of the monotonic clock.
+    ``size`` is None for a message that is no image and is refused at once.  ``time`` is its arrival, ``deadline`` the
+    end of its wait for camera_info and mask, seconds of the monotonic clock.
     """
 
     message: DepthMessage
@@ -89,7 +89,7 @@ class Input:
         self._numbers_note: tuple[str, ...] = ()
         self._last_image = monotonic()
         self._changed = threading.Condition()
-        """Guards what follows."""
+        """Guards the following attributes."""
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=_INFOS)

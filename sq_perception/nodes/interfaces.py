@@ -1,4 +1,4 @@
-"""What nodes offer in messages of the package sq_msgs, where that is built; without it nothing here is there."""
+"""Interfaces of the package sq_msgs that nodes offer if it is built."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sq_msgs_py.message_types import installed
 from sq_perception.recordings.publication import Findings
 
 Outcomes = Callable[[], Awaitable[tuple[bool, str, Findings | None]]]
-"""Recovers the next image: success, summary or reason, and what was found."""
+"""Recovers the next image: success, summary or reason, and the bodies."""
 
 
 def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any, **more: Any) -> Any:
-    """What ``create`` makes of an interface of sq_msgs, named package/msg/Name; None where that is not there."""
+    """Return what ``create`` makes of an interface package/msg/Name of sq_msgs; None if it is not installed."""
     try:
         return create(installed(name), *arguments, **more)
     except ModuleNotFoundError:
@@ -29,7 +29,7 @@ def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any,
 
 
 class RecoverInterfaces:
-    """``~/recover_array``, which answers with the bodies of the next image, and the action ``~/recover_images``."""
+    """The service ``~/recover_array`` for the next image, and the action ``~/recover_images``."""
 
     def __init__(self, node: Node, outcomes: Outcomes, group: CallbackGroup) -> None:
         self._outcomes = outcomes
@@ -50,7 +50,7 @@ class RecoverInterfaces:
         self._server = optional(node, served, "sq_msgs/action/Recover")
 
     def close(self) -> None:
-        """Take the action down, which rclpy does not with its node."""
+        """Destroy the action, which rclpy does not destroy with its node."""
         server, self._server = self._server, None
         if server is not None:
             server.destroy()
@@ -59,7 +59,7 @@ class RecoverInterfaces:
         return await self._answer(response)
 
     async def _on_images(self, goal: Any) -> Any:
-        """Recover as many images as the goal asks for; the first that is none ends it."""
+        """Recover as many images as the goal asks for; the first failure ends it."""
         result = self._result()
         for _ in range(max(int(goal.request.images), 1)):
             if goal.is_cancel_requested:

@@ -33,11 +33,11 @@ _RELIABILITIES = {
     "reliable": QoSReliabilityPolicy.RELIABLE,
     "best_effort": QoSReliabilityPolicy.BEST_EFFORT,
 }
-"""What the override may be, as rmw names it; None follows the publishers."""
+"""Values of the override, as rmw names them; None follows the publishers."""
 _OVERLAP = 1.0
 """Seconds for which a subscription outlives its replacement, which a publisher may find late."""
 _REMEMBERED = 8
-"""Messages that are remembered meanwhile: more than are on their way at once."""
+"""Messages that are remembered during that time: more than are in transit at once."""
 
 
 class Listener:
@@ -58,13 +58,13 @@ class Listener:
         """The resolved name."""
         self._asked = _reliability_override(node, self.topic)
         self._heard: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
-        """Stamps of the last messages, and which subscription heard them."""
+        """Stamps of the last messages, and the subscription that received them."""
         self._count, self._since = 0, 0.0
-        """How many subscriptions there have been, and when the last one was made."""
+        """Number of subscriptions so far, and the time of the last one."""
         self._lock = threading.Lock()
         """Guards the subscriptions: they are replaced in the executor's thread and closed in another one."""
         self._subscriptions: list[Subscription] = []
-        """The present one last; before it one that it replaces."""
+        """The current subscription last; before it the one that it replaces."""
         with self._lock:
             self._subscribe(self._choose_reliability())
 

@@ -61,11 +61,11 @@ class LiveParameters(Generic[P]):
     Parameters
     ----------
     locked
-        Why what is not live cannot change now; empty where it can.  None: it never can.
+        Returns why parameters that are not live cannot change now; empty if they can.  None: they never can.
     check
-        Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
+        Raises ValueError for an invalid set of values; also gets the names of those that change.
     changed
-        Called with the new values and which of them were set.
+        Called with the new values and the names of those that were set.
     defaults
         Of this node, in place of the dataclass'.
 
@@ -89,7 +89,7 @@ class LiveParameters(Generic[P]):
         self._fixed = {parameter.name for parameter in fields(kind) if not parameter.metadata["live"]}
         self._locked, self._check, self._changed, self._defaults = locked, check, changed, defaults
         self.current: P = kind(**self._values([self._declare(node, parameter) for parameter in fields(kind)]))
-        """The values in force: an immutable set, replaced as a whole."""
+        """The current values: an immutable set, replaced as a whole."""
         node.add_pre_set_parameters_callback(lambda changes: [self._cast(change) for change in changes])
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)

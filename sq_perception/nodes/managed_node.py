@@ -45,9 +45,9 @@ _NAMES = {
     Transition.TRANSITION_ACTIVE_SHUTDOWN: "shutdown",
 }
 _EXPECTED = (ValueError, OSError, RuntimeError)
-"""What a wrong file, parameter or device raises; anything else is a defect and leaves its trace in the log."""
+"""Errors of a wrong file, parameter or device; any other is a program error and logged with its traceback."""
 _PAUSE = 2.0
-"""Seconds before a node that failed while active tries again."""
+"""Seconds before a node that failed while active restarts."""
 _END = 4.0
 """Seconds that :meth:`ManagedNode.close` waits for a transition."""
 
@@ -66,7 +66,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self.fault = ""
         """Why the last transition failed; empty once one has succeeded."""
         self.start_failure = ""
-        """Why the node could not bring itself up; its process then ends."""
+        """Why the node could not start itself; its process then ends."""
         self._starts_itself = False
         self._closing = threading.Event()
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -92,7 +92,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def start(self, autostart: bool = True) -> None:
         """Configure and activate, now and after a fault; :attr:`start_failure` holds the reason of a failure.
 
-        Without ``autostart`` only say that somebody else has to.
+        Without ``autostart`` only log that a manager must do so.
         """
         if not autostart:
             self.get_logger().info(

@@ -50,14 +50,14 @@ from sq_perception.recovery.recovery import timed
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 ARRIVAL = Duration(seconds=0.5)
-"""How long the last markers may take to arrive before their publisher goes."""
+"""Seconds that the last markers may take to arrive before their publisher is destroyed."""
 _ALL_AGAIN = 5.0
-"""Seconds between two messages of the whole planning scene: a planner takes none while it plans, its queue holds ten,
-and what fell out of it would stay for good in its world as it was."""
+"""Seconds between two messages of the whole planning scene: a planner receives none while it plans, its queue holds
+ten, and a lost message would leave its world wrong for good."""
 _REPEATED = 10.0
-"""Seconds for which a marker is deleted again and again: longer than RViz is busy with something else."""
+"""Seconds for which the deletion of a marker is repeated: longer than RViz is ever busy."""
 _MOST_AGAIN = 32
-"""Ids of which that is done, those that went last: each costs a message 0.1 ms."""
+"""Number of ids whose deletion is repeated, the last ones: each costs 0.1 ms per message."""
 
 
 class MarkerIds:
@@ -68,7 +68,7 @@ class MarkerIds:
 
     def __init__(self) -> None:
         self._until: dict[int, float] = {}
-        """Until when they are deleted, in the order in which they went; endless while they are shown."""
+        """Time until which each deletion is repeated, in order of deletion; endless while the marker is shown."""
 
     def replace_markers(self, ids: Sequence[int]) -> list[int]:
         """Return the ids whose markers the next message, which shows ``ids``, must delete."""
@@ -139,7 +139,7 @@ class Outputs:
             )
         if shown.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
             self.support_plane.publish(plane_message(shown.plane, shown.header))
-        self.superquadrics.publish(to_message(shown.array, shown.header))
+        self.superquadrics.publish(to_message(shown.cloud, shown.header))
 
     def accompany(
         self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters, stages: dict[str, float]
@@ -188,7 +188,7 @@ _KINDS = {
     "publish_detections": ("vision_msgs", "Detection3DArray", "~/detections", 10),
     "publish_collision_objects": ("moveit_msgs", "PlanningScene", "~/planning_scene", 10),
 }
-"""Package, message, topic and queue of what a parameter asks for."""
+"""Package, message, topic and queue of each optional output."""
 
 
 class OptionalOutputs:
@@ -198,7 +198,7 @@ class OptionalOutputs:
         self._node = node
         self._publishers: dict[str, Publisher] = {}
         self.absent: dict[str, str] = {}
-        """Packages that are missing, by what asks for them; replaced as a whole, for other threads."""
+        """Missing packages by output; replaced as a whole, for other threads."""
         self._scene = collision_objects.Scene()
         self._planner_came = threading.Event()
         self._all_due = 0.0

@@ -24,7 +24,7 @@ RAW, POINTS = "raw", "points"
 """Plain images, and clouds of points, as image_transport names them."""
 EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
 _KEEPS_ALL = 100.0
-"""Metres: the value of depth_max that leaves nothing out."""
+"""Metres: the value of depth_max that keeps all readings."""
 
 
 def _check_box(name: str, box: tuple[float, ...]) -> None:
@@ -147,8 +147,8 @@ class RecoverParameters(Parameters):
     )
     camera_frame: str = setting(
         "",
-        "tf2 frame, optical, of the camera that took the points (image_transport: points), where they come in another "
-        "one. Empty: that of the points.",
+        "Optical tf2 frame of the camera that took the points (image_transport: points), if they are in another frame. "
+        "Empty: the points' frame.",
     )
     tf_tolerance: float = setting(
         0.1,
@@ -183,6 +183,9 @@ class RecoverParameters(Parameters):
     repair: bool = setting(
         True, "Split, join and drop own segments with a network; exclude readings of neighbours from fits."
     )
+    parts: bool = setting(
+        False, "Also recover the parts of objects that one body does not explain (see docs/points.md)."
+    )
 
     @property
     def box(self) -> Box | None:
@@ -203,6 +206,7 @@ class RecoverParameters(Parameters):
             free_space=has_free_space,
             time_budget=self.time_budget or math.inf,
             repair=self.repair,
+            parts=self.parts,
         )
 
     def __post_init__(self) -> None:

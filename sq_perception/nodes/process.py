@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
-"""Threads that spin while they wait take the cores from the nodes beside them: on two busy cores a frame took 30 ms
-with these settings and 50 to 150 ms without.  Small solves and small images gain nothing from a second thread: OpenCV's
-took a tenth of the processor time of a VGA frame of one body, and made it 2 % faster on an idle core."""
+"""Spinning threads take cores from other nodes: on two busy cores a frame took 30 ms with these settings and 50 to 150
+ms without. Small solves and images gain nothing from a second thread: OpenCV's took a tenth of the processor time of a
+VGA frame of one body, and saved 2 % on an idle core."""
 _M_ARENA_MAX, _HEAPS = -8, 2
-"""The option of glibc's malloc.h, and how many heaps a process gets: with one, threads waited for each other, and a
-frame took 10 % more processor time; with two, it took what it takes with one for each thread."""
+"""The option of glibc's malloc.h, and the number of heaps: with one, threads waited for each other and a frame took 10
+% more processor time; with two it took the same as with one per thread."""
 _LOOK = 0.1
-"""Seconds between two looks at whether a signal has arrived."""
+"""Seconds between two checks for a signal."""
 
 
 _Node = TypeVar("_Node", bound="Stoppable")
 REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-"""Where rclpy is not there."""
+"""Advice if rclpy is missing."""
 
 
 class Stoppable(Protocol):
     """An rclpy node that may fail to start, and must be stopped before it is destroyed."""
 
     start_failure: str
-    """Why the node cannot start, once it has found out; its process then ends."""
+    """Why the node cannot start, once known; its process then ends."""
 
     def close(self) -> bool:
         """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""
@@ -63,8 +63,8 @@ class Stoppable(Protocol):
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
     """Create nodes and spin them until they are asked to stop; return the exit code.
 
-    ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
-    Nodes that it has yielded are closed also where a later one cannot be made.
+    ``create`` imports what the nodes need, so that this function handles signals during the seconds of imports.  Nodes
+    that it has yielded are closed even if a later one cannot be made.
     """
     if importlib.util.find_spec("rclpy") is None:
         print(f"{name} needs ROS 2 in Python: {REMEDY}", file=sys.stderr)
@@ -123,8 +123,8 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
 def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
     """Create a node of this class.
 
-    Where it cannot be made, what is there of it is destroyed before the error goes on: the memory that it shares with
-    other processes would outlive this one, and a launch file tries again and again.
+    If that fails, the unfinished node is destroyed before the error is raised: its shared memory would outlive this
+    process, and a launch file tries again and again.
     """
     node = kind.__new__(kind)
     try:

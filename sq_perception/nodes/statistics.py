@@ -17,20 +17,20 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
 THROTTLE = 5.0
-"""Seconds between two messages of the same place in the log."""
+"""Seconds between two log messages of the same place."""
 OLDEST = 3600.0
-"""Seconds; the age of an older message, or one from the future, means nothing: it is of a bag, or another clock."""
+"""Seconds; older messages, or ones from the future, come from a bag or another clock, and their age is ignored."""
 SECONDS = 10.0
-"""What rates and latencies are taken over."""
+"""Window of rates and latencies, seconds."""
 _MOST = 5000
-"""Events that are kept: more than any camera causes in that time."""
+"""Number of events kept: more than any camera causes in that time."""
 WITHOUT_MASK = "without mask"
-"""Frames that were segmented by the node, though somebody publishes masks."""
+"""Frames that the node segmented although masks are published."""
 DOUBTED = "doubted"
-"""Frames that seem to be in another unit or of another kind."""
+"""Frames that seem to have another unit or kind."""
 _OUTCOMES = ("answered", "dropped", "refused")
 _SLOW = 3.0
-"""Seconds after which a frame without an outcome is more than a start."""
+"""Seconds without an outcome that are too long even for a start."""
 Standing = tuple[bytes, str]
 """Level and message of a DiagnosticStatus."""
 
@@ -46,9 +46,9 @@ class Statistics:
         self._stages: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_MOST)
         self._lost: Counter[str] = Counter()
         self._reported: tuple[Counter[str], Counter[str]] = Counter(), Counter()
-        """Counts, and lost ones, when the last status was made."""
+        """Counts and lost messages at the last status."""
         self._stood = self._started
-        """When something else than frames was last reported, such as that nobody wants them."""
+        """Time of the last report about something other than frames, such as that the node is disabled."""
         self._last_error = self._last_answer = self._last_doubt = ""
 
     def count(self, what: str, number: int = 1) -> None:

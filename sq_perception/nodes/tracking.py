@@ -84,8 +84,8 @@ class CameraPoses:
     def follow(self, stamp: int) -> None:
         """Note the stamp of the next image, nanoseconds, before its pose is requested.
 
-        After a jump back, as where a recording begins again, what was heard is forgotten: transforms of the old time
-        would shadow the new ones, and tf2 takes none that is 10 s older than its newest.
+        After a jump back, as when a recording restarts, the buffer is cleared: old transforms would shadow new ones,
+        and tf2 accepts none that is 10 s older than its newest.
         """
         if stamp < self._stamp and self._buffer is not None:
             self._buffer.clear()

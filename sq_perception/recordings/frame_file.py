@@ -154,7 +154,9 @@ class Reading:
             raise ValueError(f"region: expected left, top >= 0 and width, height >= 1, got {self.region}")
 
     def z(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Depth along the optical axis of a rectified image of this kind."""
+        """Depth along the optical axis of a rectified image of this kind.  ValueError where a cloud was announced."""
+        if self.frame is not None:
+            raise ValueError("frame: expected a cloud, got a depth image, which is in the frame of its camera")
         return depth_units.z_from_range(depth, camera) if self.kind == "range" else depth
 
     def labels(self, name: str, like: np.ndarray) -> np.ndarray | None:

@@ -80,7 +80,8 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
         if 0 <= body.label < len(numbers):
             numbers[body.label] = k + 1
         if body.status != Status.FAILED:
-            bodies.append(_body(k, body.superquadric, body.sigma_size, up))
+            fits = (body.fit,) if body.parts is None else body.parts.fits
+            bodies += [_body(k, fit.superquadric, fit.sigma_size, up) for fit in fits]
     low = points.min(axis=0) if len(points) else np.zeros(3)
     step = np.maximum((points.max(axis=0) if len(points) else low) - low, 1e-9) / np.iinfo(np.uint16).max
     middle = np.median(points, axis=0) if len(points) else np.array([0.0, 0.0, 1.0])

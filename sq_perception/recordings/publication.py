@@ -25,6 +25,7 @@ from sq_msgs_py.depth_image import (
     pixels_from_message,
 )
 from sq_msgs_py.markers import ALPHA, markers
+from sq_msgs_py.markers import Mesh as MarkerMesh
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
 from sq_perception.fitting.covariance import undetermined
@@ -136,8 +137,10 @@ class Findings:
     ----------
     array
         Every object, failed ones included.
+    parts
+        The parts of those that have some; ids are shared.
     covariances : (n, 6, 6)
-        Of their poses, as in :mod:`sq_msgs_py.poses`; NaN where unknown.
+        Of the objects' poses, as in :mod:`sq_msgs_py.poses`; NaN where unknown.
     header
         std_msgs/Header: the stamp of the image, and the frame that all this is in.
     plane : (4,) or None
@@ -148,6 +151,12 @@ class Findings:
     covariances: np.ndarray
     header: Any
     plane: np.ndarray | None = None
+    parts: SuperquadricArray = field(default_factory=SuperquadricArray.empty)
+
+    @property
+    def cloud(self) -> SuperquadricArray:
+        """All rows of the published cloud: the objects, then their parts."""
+        return self.array.followed_by(self.parts)
 
     @property
     def shown_ids(self) -> list[int]:
@@ -167,6 +176,7 @@ class Findings:
             covariances=poses.moved_covariances(self.covariances, rotation),
             header=poses.header_in(self.header, frame_id),
             plane=None if self.plane is None else poses.moved_plane(self.plane, rotation, translation),
+            parts=poses.moved(self.parts, rotation, translation),
         )
 
     def markers(
@@ -175,17 +185,16 @@ class Findings:
         alpha: float = ALPHA,
         types: MessageTypes = installed,
     ) -> Any:
-        """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted.
+        """A MarkerArray of the bodies that did not fail, or their parts; those of ``previous_ids`` that are gone are
+        deleted.
 
         Colours are by id; ``alpha`` is their opacity.
         """
-        shown = self.array.recovered
-        turns = poses.matrices(poses.unit_quaternions(shown.rotation))
-        surfaces, bodies = [], _in_own_frames(shown)
-        for k, (vertices, faces) in enumerate(self.meshes):
-            turn, centre = turns[k].T, shown.translation[k].astype(float)
-            lines = outline(bodies[k])
-            surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
+        shown, surfaces = self.array.recovered, []
+        for k, mesh in enumerate(self.meshes):
+            parts = self.parts.parts_of(shown.id[k])
+            meshes = [triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(parts)] or [mesh]
+            surfaces.append(_join(meshes, parts if len(parts) else shown.where(np.arange(len(shown)) == k)))
         return markers(surfaces, self.shown_ids, self.header, alpha=alpha, previous_ids=previous_ids, types=types)
 
 
@@ -197,7 +206,23 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     change = np.zeros((len(array), 6, 6))
     change[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) if is_cube else np.eye(3)
     change[:, 3:, 3:] = poses.matrices(poses.unit_quaternions(array.rotation))
-    return Findings(array, change @ covariances.reshape(-1, 6, 6) @ np.swapaxes(change, 1, 2), header, recovery.plane)
+    moved = change @ covariances.reshape(-1, 6, 6) @ np.swapaxes(change, 1, 2)
+    return Findings(array, moved, header, recovery.plane, superquadric_array(_take_parts(found), is_cube))
+
+
+def _take_parts(found: Identified) -> Identified:
+    """Replace the objects of a frame by their parts."""
+    bodies, ids = [], []
+    columns: dict[str, list[int]] = {"seen": [], "reason": [], "part": []}
+    for k, body in enumerate(found.recovery.bodies):
+        for number, fit in enumerate(body.parts or (), 1):
+            bodies.append(replace(body, fit=fit, score=np.nan, parts=None))
+            ids.append(found.ids[k])
+            columns["seen"].append(found.columns["seen"][k] if "seen" in found.columns else 0)
+            columns["reason"].append(_reason(fit, fit.superquadric))
+            columns["part"].append(number)
+    known = {name: tuple(values) for name, values in columns.items()}
+    return Identified(replace(found.recovery, bodies=tuple(bodies)), tuple(ids), columns=known)
 
 
 def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
@@ -233,6 +258,18 @@ def superquadrics(array: SuperquadricArray) -> Superquadric:
 def _in_own_frames(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, each in its own frame."""
     return Superquadric.at_origin(array.size, array.shape).with_taper(np.asarray(array.taper, float))
+
+
+def _join(meshes: Sequence[Mesh], array: SuperquadricArray) -> MarkerMesh:
+    """Join meshes of the bodies of a message, each in its own frame, in the message's frame, with their outlines."""
+    turns = poses.matrices(poses.unit_quaternions(array.rotation))
+    vertices, faces, lines, count = [], [], [], 0
+    for (own, corners), body, turn, centre in zip(meshes, _in_own_frames(array), turns, array.translation, strict=True):
+        vertices.append(own @ turn.T + centre)
+        faces.append(corners + count)
+        lines.append(outline(body) @ turn.T + centre)
+        count += len(own)
+    return np.concatenate(vertices), np.concatenate(faces), np.concatenate(lines)
 
 
 def covariances(array: SuperquadricArray) -> np.ndarray:

@@ -183,7 +183,7 @@ class ResultBag:
             # Not 16UC1, which would look like depth to whoever reads the file.
             kind = "mono16" if labels.max(initial=0) <= np.iinfo(np.uint16).max else "32SC1"
             messages.append((LABELS, depth_image.labels_to_message(labels, header, kind, types)))
-        messages.append((SUPERQUADRICS, to_message(shown.array, header, types)))
+        messages.append((SUPERQUADRICS, to_message(shown.cloud, header, types)))
         messages.append((MARKERS, shown.markers(self._shown_ids, types=types)))
         if "rendered" in self._images:
             depth, _ = render_recovery(found.recovery, frame.camera)

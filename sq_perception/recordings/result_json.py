@@ -22,7 +22,7 @@ from typing import Any
 from sq_perception.files import output_file
 from sq_perception.files.version import __version__
 from sq_perception.fitting.covariance import undetermined
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.recordings.frame_file import RecordedFrame, Stamp
@@ -69,6 +69,7 @@ def frame_entry(
                 "pixels": body.pixels,
                 "objectness": body.objectness,
                 "track": None if track is None else _track_entry(track, frame.is_cube),
+                "parts": _part_entries(body.parts, frame.is_cube),
             }
         )
     entry = {
@@ -114,6 +115,22 @@ def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
     }
 
 
+def _part_entries(parts: Parts | None, is_cube: bool) -> list[dict[str, Any]]:
+    """Return the elements of ``parts``: none where one body explains the object."""
+    return [
+        {
+            **_parameters(in_result_frame(fit.superquadric, is_cube)),
+            "sigma_size": fit.sigma_size,
+            "residual": fit.residual,
+            "seen": fit.seen,
+            "share": share,
+            "status": fit.status.name.lower(),
+            "message": fit.message,
+        }
+        for fit, share in (() if parts is None else zip(parts, parts.shares.tolist(), strict=True))
+    ]
+
+
 def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
     """A body in the coordinates that results are given in."""
     return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
@@ -141,7 +158,7 @@ def document(
 
 
 def table(frames: Sequence[Mapping[str, Any]]) -> str:
-    """The bodies as CSV, a row each under a line of names; numbers as in the document, empty where unknown."""
+    """Bodies, each before its parts, as CSV, a row each under a line of names; empty where unknown."""
     axes = ("1", "2", "3")
     columns = {
         "size": [f"a{k}" for k in axes],
@@ -156,13 +173,15 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = [name for group in columns.values() for name in group]
-    writer.writerow(["file", "stamp", "body", "status", "id", "coordinates", *names, *single])
+    writer.writerow(["file", "stamp", "body", "status", "id", "coordinates", *names, *single, "part"])
     for frame in frames:
         stamp = "" if frame["stamp"] is None else str(Stamp(**frame["stamp"]))
         for number, body in enumerate(frame["superquadrics"]):
             track = body["track"] and body["track"]["id"]
-            values = [value for group in columns for value in body[group]] + [body[name] for name in single]
-            writer.writerow([frame["file"], stamp, number, body["status"], track, frame["coordinates"], *values])
+            for part, shown in enumerate([body, *body.get("parts", ())]):
+                values = [value for group in columns for value in shown[group]]
+                values += [shown.get(name) for name in single] + [part]
+                writer.writerow([frame["file"], stamp, number, shown["status"], track, frame["coordinates"], *values])
     return text.getvalue()
 
 

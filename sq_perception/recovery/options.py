@@ -44,6 +44,9 @@ class RecoveryOptions(SegmentationOptions):
     repair
         Part and join own segments, drop those of no object, and leave outliers out of fits, by a network; with the
         method ``auto`` and a network that predicts hulls alone.  Masks from outside stay as they are.
+    parts
+        Whether to look for the parts of each object (:mod:`sq_perception.recovery.parts`), beside its body; with the
+        methods ``auto`` and ``symmetry``, of a pinhole camera's images.
 
     Raises
     ------
@@ -57,6 +60,7 @@ class RecoveryOptions(SegmentationOptions):
     time_budget: float = np.inf
     free_space: bool = True
     repair: bool = True
+    parts: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -35,14 +35,14 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_blas_thread, short_turns
 from sq_perception.imaging import depth_units, hole_filling, ranges, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.recovery import methods, prediction, seen_object, supports
+from sq_perception.recovery import methods, parts, prediction, seen_object, supports
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
@@ -269,14 +269,15 @@ class Recoverer:
                 fresh = [obj.of_readings(depth, readings.closed, found.segmentation.labels) for obj in fresh]
             deadline = readings.began + options.time_budget
             fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), fresh)
+            made_of = self._find_parts(fresh, fits, depth, readings, network, deadline)
             fitted = time.perf_counter()
 
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
         segmentation = found.segmentation
         likely = dict(zip(segmentation.ids, segmentation.objectness, strict=False))
         recovered = {
-            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0))
-            for obj, fit, score in zip(fresh, fits, scores, strict=True)
+            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0), parts=some)
+            for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True)
         }
         bodies = tuple(known[obj.label] if obj.label in known else recovered[obj.label] for obj in found.objects)
         scored = time.perf_counter()
@@ -336,6 +337,34 @@ class Recoverer:
             found = prediction.of_bodies(views, network, when_asked=options.method == "auto")
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
+    def _find_parts(
+        self,
+        objects: Sequence[SeenObject],
+        fits: Sequence[Fit],
+        depth: np.ndarray,
+        readings: Readings,
+        network: Network | None,
+        deadline: float,
+    ) -> list[Parts | None]:
+        """Find the parts of each object; None where one body explains it, or parts are not asked for."""
+        camera, options = readings.camera, readings.options
+        if not options.parts or options.method not in ("auto", "symmetry"):
+            return [None] * len(objects)
+        config = None if network is None else network.config
+        searches = self._mapped(lambda k: parts.Search(objects[k], fits[k], depth, camera), range(len(objects)))
+        divided = self._mapped(parts.Search.next_pieces, searches)
+        while any(divided) and time.perf_counter() < deadline:
+            pieces = [piece for some in divided for piece in some]
+            pieces = self._mapped(lambda each: seen_object.viewed(each, depth, camera, config), pieces)
+            if network is not None:
+                pieces = self._predict(pieces, network, options)
+            found = iter(self._mapped(lambda each: methods.fit_view(each, depth, camera, options, deadline), pieces))
+            for search, some in zip(searches, divided, strict=True):
+                if some:
+                    search.judge([next(found) for _ in some])
+            divided = self._mapped(parts.Search.next_pieces, searches)
+        return [search.parts for search in searches]
+
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
         if len(items) < 2 or self._threads < 2:
@@ -371,7 +400,7 @@ class Recoverer:
 
 
 def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What the recovered bodies would look like to the camera.
+    """What the recovered bodies, or their parts, would look like to the camera.
 
     Returns
     -------
@@ -380,9 +409,9 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
     index : int32 (height, width)
         Position in ``frame.bodies``, -1 where there is none; failed bodies are not drawn.
     """
-    shown = [k for k, body in enumerate(frame.bodies) if body.status != Status.FAILED]
-    depth, index = raycast.render(Superquadric.stack([frame.bodies[k].superquadric for k in shown]), camera)
-    return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
+    shown = [(k, solid) for k, body in enumerate(frame.bodies) if body.status != Status.FAILED for solid in body.solids]
+    depth, index = raycast.render(Superquadric.stack([solid for _, solid in shown]), camera)
+    return depth, np.append(np.array([k for k, _ in shown], dtype=np.int32), np.int32(-1))[index]
 
 
 def _measure(depth: np.ndarray, camera: Camera) -> np.ndarray:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
 
 
@@ -37,6 +37,8 @@ class Recovery:
     repeats : int
         Frames before this one whose readings the body was recovered from, as these are the same but for noise
         (:mod:`sq_perception.recovery.still_scene`): an answer given before, with the same error.  0: from this frame.
+    parts : Parts or None
+        The bodies that it is made of, if they were asked for and explain the image better than one body does.
     """
 
     fit: Fit
@@ -45,11 +47,17 @@ class Recovery:
     pixels: int
     objectness: float = 1.0
     repeats: int = 0
+    parts: Parts | None = None
 
     @property
     def superquadric(self) -> Superquadric:
         """A single body in the optical frame, in its canonical form."""
         return self.fit.superquadric
+
+    @property
+    def solids(self) -> tuple[Superquadric, ...]:
+        """What it looks like: its parts, or its body where it has none."""
+        return (self.superquadric,) if self.parts is None else tuple(fit.superquadric for fit in self.parts)
 
     @property
     def residual(self) -> float:

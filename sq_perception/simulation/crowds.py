@@ -34,7 +34,7 @@ def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAME
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 12, or the bodies find no room in the image.
+        If ``count`` is not 1 to 12, or the bodies do not fit into the image.
     """
     if not 1 <= count <= MOST:
         raise ValueError(f"count: expected 1 to {MOST} bodies, got {count}")

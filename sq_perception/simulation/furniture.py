@@ -154,7 +154,7 @@ def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TA
     Raises
     ------
     ValueError
-        If the objects find no room in the camera's image, or the furniture hides all of them again and again.
+        If the objects do not fit into the camera's image, or the furniture always hides all of them.
     """
     kind = _KINDS[name]
     for _ in range(_TRIES):

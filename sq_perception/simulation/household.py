@@ -258,4 +258,4 @@ _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thin
     "union": (0.04, ((_toy, 1.0),)),
     "soft": (0.04, ((_bag, 1.0),)),
 }
-"""How often each kind comes where nothing else is asked for, and its families with how often each of these comes."""
+"""Default frequency of each kind, and its families with their frequencies."""

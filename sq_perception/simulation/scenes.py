@@ -46,7 +46,7 @@ _GAP = 0.015
 _FLAT_BELOW = 0.5
 _ATTEMPTS = 2000
 _VIEWS = 10
-"""Views of the table, one after the other: in one of seven ten bodies find no room."""
+"""Number of views of the table that are tried: in one of seven, ten bodies do not fit."""
 _FARTHEST = 4.0
 
 
@@ -98,7 +98,7 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 10, the camera is no pinhole, or the bodies find no room in its image.
+        If ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its image.
     """
     if not 1 <= count <= MAX_TABLE_BODIES:
         raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
@@ -150,8 +150,7 @@ def turn_about_up(yaw: float) -> np.ndarray:
 def resting_body(
     rng: np.random.Generator, plane: np.ndarray, reach: float = _PLACE_RADIUS
 ) -> tuple[Superquadric, float]:
-    """A random body that touches the plane within ``reach`` metres of where the camera looks, and the radius, metres,
-    of the ball about its centre that holds it."""
+    """Draw a body on the plane within ``reach`` metres of where the camera looks, and its bounding radius, metres."""
     normal, offset = plane[:3], plane[3]
     size, shape = rng.uniform(*_TABLE_SIZE, 3), rng.uniform(*_TABLE_SHAPE, 2)
     upright = int(rng.integers(3)) if shape.max() < _FLAT_BELOW else int(np.argmin(size))

@@ -37,7 +37,7 @@ _ANY_SENSOR = 0.35
 _FOCALS = (430.0, 700.0)
 """Pixels, at VGA: depth cameras, 49 to 73 degrees wide."""
 _WIDTHS, _OF_WIDTHS = (160, 320, 640, 1280), (0.1, 0.1, 0.65, 0.15)
-"""Pixels a row, and shares of the scenes that have so many."""
+"""Pixels per row, and the share of scenes of each."""
 _ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0.65, 0.15)
 """Degrees that the camera is above the table, and shares of the scenes."""
 _CROWDS, _IN_FURNITURE = 0.2, 0.3

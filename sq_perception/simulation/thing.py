@@ -68,7 +68,7 @@ class Thing:
     rests : tuple of Rest
         How it may lie; their probabilities add up to 1.
     cavities : Superquadric
-        Batch (m,), m >= 0: what is cut away from the union.
+        Batch (m,), m >= 0: cavities, removed from the union.
     surface : Mesh, optional
         What is seen in place of the union, where the parts only have its hull.
     """

@@ -58,7 +58,7 @@ class Setting:
     surface : Mesh, optional
         The object's surface, if it is seen as a mesh.
     height
-        Height above the table of what the object stands on, metres.
+        Height above the table of the object's support, metres.
     """
 
     parts: Superquadric

@@ -163,8 +163,7 @@ def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tupl
 
 
 def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """The image and the object's mask; in some something nearer comes in from one side: a straight edge, a corner or a
-    round object."""
+    """Return image and mask, some with an occluder from one side: a straight edge, a corner or a round object."""
     if rng.random() > BEFORE or not seen.any():
         return depth, seen
     v, u = np.nonzero(seen)

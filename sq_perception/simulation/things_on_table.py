@@ -18,6 +18,7 @@ Metres; depth is the z coordinate, +inf where nothing is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -96,7 +97,7 @@ class ThingsOnTable:
     depth : float64 (height, width)
         +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
     labels : int32 (height, width)
-        True masks, 0 for what is no object.
+        True masks, 0 for no object.
     plane : (4,)
         Height above the table = n.p + d.
     table : (3, 3)
@@ -150,15 +151,16 @@ def things_on_table(
     count: int | None = None,
     camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION,
+    kinds: Sequence[str] | None = None,
 ) -> ThingsOnTable:
-    """Place ``count`` objects, or 1 to 8, on a table, all wholly inside the image.
+    """Place ``count`` objects, or 1 to 8, of some kinds or of any, on a table, all wholly inside the image.
 
     The camera is ``elevation`` (least, greatest) degrees above the table.
 
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 8, the camera is no pinhole, or the objects find no room in its image.
+        If ``count`` is not 1 to 8, the camera is no pinhole camera, or the objects do not fit into its image.
     """
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
@@ -168,14 +170,19 @@ def things_on_table(
     for _ in range(_SCENES):
         look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
         eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
-        resting = _arrange(wanted, look, eye, camera, rng)
+        resting = _arrange(wanted, look, eye, camera, rng, kinds)
         if resting is not None:
             return _seen(resting, look, eye, camera, rng)
     raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
 
 
 def _arrange(
-    count: int, look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
+    count: int,
+    look: np.ndarray,
+    eye: np.ndarray,
+    camera: Camera,
+    rng: np.random.Generator,
+    kinds: Sequence[str] | None,
 ) -> list[_Resting] | None:
     resting: list[_Resting] = []
     spread = rng.uniform(0.08, 0.3)
@@ -183,7 +190,7 @@ def _arrange(
     while failed < _TRIES:
         failed += 1
         how = str(rng.choice(_HOW)) if resting else "apart"
-        placed = _draw(draw_thing(rng), how, resting, spread, rng)
+        placed = _draw(draw_thing(rng, kinds), how, resting, spread, rng)
         if placed is None or not _in_view(placed, look, eye, camera):
             continue
         if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):

@@ -66,7 +66,7 @@ def render_views(
     occluder: Occluder | None = None,
     miss: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Superquadric]:
-    """The canonical view of each body alone, fitted to what is visible of it as :func:`canonical_view.from_mask` does.
+    """Render the canonical view of each body alone, fitted to its visible part as :func:`canonical_view.from_mask`.
 
     Parameters
     ----------

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from table_scenes import VGA, Table
 
 from sq_perception.commands import main, recover_outputs
 from sq_perception.commands.console import complain
@@ -302,7 +303,7 @@ def test_the_schema_describes_what_is_written(tmp_path, repository):
     np.savez(tmp_path / "2.5.npz", depth=np.full((8, 8), np.nan), projection="orthographic")
     lines = tmp_path / "out.jsonl"
     names = tmp_path / "1.5.npz", tmp_path / "2.5.npz"
-    first, second = recover(tmp_path, *names, "--track", "--jsonl", lines)
+    first, second = recover(tmp_path, *names, "--track", "--parts", "--jsonl", lines)
     jsonschema.validate(json.loads((tmp_path / "out.json").read_text()), schema)
     head, *frames = map(json.loads, lines.read_text().splitlines())
     jsonschema.validate({**head, "frames": frames}, schema)
@@ -310,6 +311,27 @@ def test_the_schema_describes_what_is_written(tmp_path, repository):
     assert (first["coordinates"], second["coordinates"]) == ("optical", "cube")
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate({**head, "frames": [{**first, "ms": "soon"}]}, schema)
+
+
+def test_parts_are_in_every_file(tmp_path, repository, capsys):
+    """A hammer on a table: beside its body, handle and head in document, table, meshes and page, and in words."""
+    jsonschema = pytest.importorskip("jsonschema")
+    table = Table(pitch=1.0, distance=0.7)
+    hammer = [table.body(0.0, 0.0, (0.09, 0.014, 0.014), height=0.006), table.body(0.1, 0.0, (0.018, 0.06, 0.02))]
+    depth, labels = table.see(hammer, 0.001)
+    np.savez(tmp_path / "a.npz", depth=depth, K=VGA.matrix, labels=np.minimum(labels, 1))
+    outputs = ("--csv", tmp_path / "out.csv", "--html", tmp_path / "out.html", "--meshes", tmp_path)
+    (frame,) = recover(tmp_path, tmp_path / "a.npz", "--parts", *outputs)
+    schema = json.loads((repository / "sq_perception" / "recordings" / "result.schema.json").read_text())
+    jsonschema.validate(json.loads((tmp_path / "out.json").read_text()), schema)
+    (body,) = frame["superquadrics"]
+    assert sorted(max(part["size"]) for part in body["parts"]) == pytest.approx([0.06, 0.09], abs=0.012)
+    assert sum(part["share"] for part in body["parts"]) > 0.9
+    rows = (tmp_path / "out.csv").read_text().splitlines()
+    assert [row.rpartition(",")[2] for row in rows] == ["part", "0", "1", "2"]
+    assert set(trimesh.load(tmp_path / "a.glb").geometry) == {"body_0_part_1", "body_0_part_2"}
+    assert (tmp_path / "out.html").read_text().count('"number": 0') == 2
+    assert "    part " in "\n".join(lines([frame], False))
 
 
 def body_entry(status="converged", message="converged", **changed):

@@ -16,8 +16,8 @@ from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import checkpoint, inference, layout
 from sq_perception.learning.forward import CompactMasks, CompactRegressor, CompactThings
 from sq_perception.learning.mask_network import MaskNetwork
-from sq_perception.learning.mirror_images import predict_with_mirror
 from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig
+from sq_perception.learning.positions import predict_in_positions
 from sq_perception.learning.regressor import Regressor
 from sq_perception.learning.thing_network import ThingNetwork
 
@@ -76,7 +76,7 @@ def test_a_random_regressor(config: RegressorConfig, rng: np.random.Generator) -
 @pytest.mark.parametrize("name", ["robust", "supervised"])
 def test_the_shipped_regressors(name: str, rng: np.random.Generator) -> None:
     views = np.where(rng.random((5, 64, 64)) < 0.4, 0, rng.random((5, 64, 64))).astype(np.float32)
-    expected, found = predict_with_mirror(checkpoint.load(name).predict, views), inference.load(name).predict(views)
+    expected, found = predict_in_positions(checkpoint.load(name).predict, views), inference.load(name).predict(views)
     np.testing.assert_allclose(found.to_flat(), expected.to_flat(), atol=1e-5)
 
 
@@ -149,5 +149,5 @@ def test_torch_computes_what_is_no_compact_network(tmp_path: Path, rng: np.rando
     checkpoint.save(tmp_path / "m.safetensors", model, dtype=np.float32)
     views, before = rng.random((2, 64, 64)), torch.get_num_threads()
     found = inference.load(tmp_path / "m.safetensors").predict(views)
-    np.testing.assert_allclose(found.to_flat(), predict_with_mirror(model.predict, views).to_flat(), atol=1e-4)
+    np.testing.assert_allclose(found.to_flat(), predict_in_positions(model.predict, views).to_flat(), atol=1e-4)
     assert torch.get_num_threads() == before

@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.choices import UNSUPERVISED
-from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views, move_bodies, move_images
+from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import any_occluder
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -39,15 +39,6 @@ class TestData:
             assert low <= values.min() < low + 0.01 * high
             assert high - 0.01 * high < values.max() <= high
             np.testing.assert_allclose(values.mean(axis=0), (low + high) / 2, rtol=0.03)
-
-    def test_dihedral_images_are_images_of_the_dihedral_bodies(self) -> None:
-        rng = np.random.default_rng(4)
-        images, bodies = draw_views(48, rng)
-        turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
-        turned, moved = move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
-        again, _ = view_rendering.render_views(moved)
-        assert ((again > 0) != (turned > 0)).mean() < 0.001
-        assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
 
     def test_pool_pairs_views_with_their_bodies(self) -> None:
         pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)

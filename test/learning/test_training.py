@@ -22,7 +22,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
-from sq_perception.learning.mirror_images import predict_with_mirror
+from sq_perception.learning.positions import predict_in_positions
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig, cosine
 from sq_perception.learning.training_state import mixed_precision
@@ -326,7 +326,7 @@ class TestThesisSetting:
         # Pixels of both sizes lie at column / (n - 1); nearest neighbours make the small frame of the large one.
         chosen = np.rint(np.linspace(0, 255, 64)).astype(int)
         expected = unit_cube.optical_from_cube(
-            predict_with_mirror(model.predict, frame[None][:, chosen][:, :, chosen])
+            predict_in_positions(model.predict, frame[None][:, chosen][:, :, chosen])
         )[0]
         assert volume_iou(body, expected) > 0.999
 

@@ -208,6 +208,9 @@ def test_a_cloud_in_another_frame_is_seen_from_its_camera(tmp_path):
     frame = read(tmp_path / "a.npz", reading=Reading(frame=CloudFrame.parse(pose)))
     np.testing.assert_allclose(frame.depth, np.where(depth > 0, depth, np.nan), rtol=1e-5)
     assert "camera at 0.3 -0.4 1.2, turned" in frame.notes
+    np.savez(tmp_path / "b.npz", depth=depth, K=CAMERA.matrix)
+    with pytest.raises(FrameError, match="frame: expected a cloud"):
+        read(tmp_path / "b.npz", reading=Reading(frame=CloudFrame.parse("link")))
     looking = read(tmp_path / "a.npz", reading=Reading(frame=CloudFrame.parse("0.3,-0.4,1.2")))
     rows, columns = np.nonzero(np.isfinite(looking.depth))
     distances = np.linalg.norm(looking.camera.unproject(columns, rows, looking.depth[rows, columns]), axis=1)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from std_msgs.msg import Header
 
-from sq_msgs_py import poses
+from sq_msgs_py import poses, superquadrics
 from sq_msgs_py.superquadrics import FAILED, WEAK, Reason
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.recordings import publication
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
@@ -82,3 +83,54 @@ def test_the_truth_is_sure_of_everything(count):
     truth = publication.truth_array(bodies)
     for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
         assert not getattr(truth, column).any()
+
+
+PLACES = np.array([[0.0, 0.0, 0.6], [0.1, 0.0, 0.6]])
+
+
+def of_two_parts():
+    """An object of two balls of 4 and 2 cm, and one that is a body alone."""
+    placed = zip((0.04, 0.02), PLACES, strict=True)
+    balls = [Superquadric(np.full(3, radius), [1.0, 1.0], at, [0.0, 0.0, 0.0, 1.0]) for radius, at in placed]
+    known = zip(balls, (Status.CONVERGED, Status.WEAK), strict=True)
+    fits = [Fit(ball, 0.002, status, "", covariance=np.eye(11) * 1e-6) for ball, status in known]
+    frame = recovery(Status.CONVERGED)
+    (body,) = frame.bodies
+    made = Recovery(body.fit, 0.9, 7, 100, parts=Parts.of(fits, np.array([0.7, 0.3]), 0.001, 1.0))
+    alone = Recovery(body.fit, 0.8, 9, 90)
+    return FrameRecovery((made, alone), {}, frame.labels, None, "")
+
+
+@pytest.mark.parametrize("is_tracked", [False, True])
+def test_parts_follow_the_objects_in_the_cloud_and_share_their_ids(is_tracked):
+    frame = of_two_parts()
+    followed = [Followed(k, 5, True, BODY, np.diag(np.square(SIGMA))) for k in (31, 32)] if is_tracked else None
+    found = publication.findings(publication.identify(frame, followed), Header(), is_cube=False)
+    read = superquadrics.from_message(superquadrics.to_message(found.cloud, Header()))
+    first, second = (31, 32) if is_tracked else (7, 9)
+    assert read.id.tolist() == [first, second, first, first]
+    assert read.part.tolist() == [0, 0, 1, 2]
+    assert read.label.tolist() == [7, 9, 7, 7]
+    assert read.recovered.id.tolist() == found.shown_ids == [first, second]
+    parts = read.parts_of(first)
+    np.testing.assert_allclose(parts.size, [[0.04] * 3, [0.02] * 3], rtol=1e-6)
+    np.testing.assert_allclose(parts.sigma_size, 1e-3, rtol=1e-6)
+    assert parts.status.tolist() == [0, 1]
+    assert np.isnan(parts.score).all()
+    assert not len(read.parts_of(second))
+
+
+def test_parts_move_with_their_objects_and_are_drawn_in_their_place():
+    """Turned by a quarter about z and shifted; one marker an object, of both balls, and no vertex off them."""
+    found = publication.findings(publication.identify(of_two_parts()), Header(), is_cube=False)
+    turn, shift = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]), np.array([0.0, 0.0, -0.6])
+    moved = found.move("base", turn, shift)
+    places = np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0]])
+    np.testing.assert_allclose(moved.parts.translation, places, atol=1e-6)
+    surfaces = [each for each in moved.markers().markers if each.ns.endswith("surface")]
+    assert [each.id for each in surfaces] == [7, 9]
+    vertices = np.array([[point.x, point.y, point.z] for point in surfaces[0].points])
+    far = np.linalg.norm(vertices[:, None] - places, axis=2)
+    of_first = far[:, 0] < far[:, 1] + 0.02
+    np.testing.assert_allclose(np.where(of_first, far[:, 0], far[:, 1]), np.where(of_first, 0.04, 0.02), atol=1e-5)
+    assert 0 < np.count_nonzero(of_first) < len(vertices)

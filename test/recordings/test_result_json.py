@@ -122,12 +122,14 @@ def test_a_row_a_body_with_the_numbers_of_the_document():
         "file": "a.npz",
         "stamp": stamp,
         "coordinates": "optical",
-        "superquadrics": [body, {**body, "track": None}],
+        "superquadrics": [{**body, "parts": [{**body, "size": [0.05, 0.2, 0.3]}]}, {**body, "track": None}],
     }
-    first, second = csv.DictReader(io.StringIO(table([frame, {**frame, "superquadrics": []}])))
+    first, part, second = csv.DictReader(io.StringIO(table([frame, {**frame, "superquadrics": []}])))
     assert (first["stamp"], first["body"], first["id"], first["a2"]) == ("3.000000040", "0", "7", "0.2")
     assert (first["sigma_a2"], first["seen_a3"], first["qw"], first["message"]) == ("", "", "1.0", "converged; a, b")
     assert (second["body"], second["id"], second["e2"], second["label"]) == ("1", "", "1.0", "")
+    assert [row["part"] for row in (first, part, second)] == ["0", "1", "0"]
+    assert (part["body"], part["id"], part["a1"]) == ("0", "7", "0.05")
 
 
 def test_equal_frames_count_one_by_one():

@@ -22,11 +22,11 @@ from sq_msgs_py.superquadrics import FIELDS, MessageError, Reason, SuperquadricA
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
 BEFORE = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
-COUNTS = ("label", "seen", "fused", "reason")
+COUNTS = ("label", "seen", "fused", "reason", "part")
 DEVIATIONS = ("sigma_shape", "sigma_centre", "sigma_turn")
 COLUMNS = (*BEFORE, *COUNTS, *DEVIATIONS, "taper", "objectness")
 LAYOUT_MORE = "label seen fused reason sigma_e1 sigma_e2 sigma_c1 sigma_c2 sigma_c3 sigma_r1 sigma_r2 sigma_r3"
-LAYOUT_LAST = "kx ky objectness"
+LAYOUT_LAST = "kx ky objectness part"
 LAYOUT_1 = "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status"
 
 
@@ -84,19 +84,20 @@ def test_one_body_reads_by_hand() -> None:
         sigma_turn=np.array([[0.5, 0.25, 0.125]]),
         taper=np.array([[0.5, -0.25]]),
         objectness=np.array([0.875]),
+        part=np.array([2]),
     )
     message = superquadrics.to_message(body, HEADER)
     assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
         HEADER,
         1,
         1,
-        136,
-        136,
+        140,
+        140,
     )
-    numbers = struct.unpack("<17f6I11f", message.data.tobytes())
+    numbers = struct.unpack("<17f6I11fI", message.data.tobytes())
     before = (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
-    assert numbers == (*before, 12, 3, 1, 4 + 8, 0.25, 0.5, 1.5, 2.5, 3.5, 0.5, 0.25, 0.125, 0.5, -0.25, 0.875)
-    assert [field.offset for field in message.fields] == list(range(0, 136, 4))
+    assert numbers == (*before, 12, 3, 1, 4 + 8, 0.25, 0.5, 1.5, 2.5, 3.5, 0.5, 0.25, 0.125, 0.5, -0.25, 0.875, 2)
+    assert [field.offset for field in message.fields] == list(range(0, 140, 4))
     assert message.is_dense
 
 
@@ -158,7 +159,7 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
     for name in ("id", "status", *COUNTS):
         points[name] = getattr(bodies, name)
     more = np.column_stack([getattr(bodies, name) for name in (*DEVIATIONS, "taper", "objectness")])
-    for k, (name, _) in enumerate(FIELDS[-11:]):
+    for k, (name, _) in enumerate(FIELDS[-12:-1]):
         points[name] = more[:, k]
     message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=400, row_step=805)
     for name in layout.names:
@@ -181,7 +182,7 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
     elif change == "unknown type":
         message.fields[3].datatype = 77
     elif change == "outside":
-        message.fields[5].offset = 134
+        message.fields[5].offset = 138
     elif change == "cut":
         message.data = message.data[:-1]
     elif change == "short row":
@@ -198,9 +199,9 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
         ("no field", "missing: x y z"),
         ("two in one", "field qx: expected one number"),
         ("unknown type", "field qx: expected one number, got datatype 77"),
-        ("outside", "field qz: offset 134 lies outside a point of 136 bytes"),
-        ("cut", "408 bytes, got 407"),
-        ("short row", "at least 408 bytes, got 100"),
+        ("outside", "field qz: offset 138 lies outside a point of 140 bytes"),
+        ("cut", "420 bytes, got 419"),
+        ("short row", "at least 420 bytes, got 100"),
         ("nan", "translation: expected finite"),
     ],
 )

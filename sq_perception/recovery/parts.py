@@ -1,0 +1,190 @@
+"""The parts of an object: bodies that explain its image together, where one body does not.
+
+Proposals.  Two points of a convex body are joined by a line that no pixel saw through (the equation is that of
+:mod:`sq_perception.segmentation.convex_parts`).  Samples of the object's pixels are clustered by average linkage, the
+distance being 1 for a crossed line and 0 for any other, and a little of the metric one; each limit of the distance
+divides the pixels into pieces.  A piece is fitted like an object of its own: other pieces' pixels beside it saw free
+space, up to what they measured.  So a part is what some pixels show: what no pixel shows is no part.
+
+Evidence.  With r the rendered less the measured depth over the noise s, of each of the n pixels of the object, 3 for
+one that no body covers, and m the pixels beside it that saw through a body by more than 3 s, k bodies leave
+
+    L = (sum of min(r^2, 9) + 9 m) / n,        D = L N / 2 + (k - 1) 11 / 2 log N.
+
+The shortest description D wins.  Pixels err together where a thing is no superquadric: they count as N witnesses.
+
+Metres, optical frame.  Reference: A. Leonardis, A. Jaklic, F. Solina, Superquadrics for Segmenting and Modeling Range
+Data, IEEE PAMI 19(11), 1997.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sq_perception.fitting.fit import Fit, Parts, Status
+from sq_perception.fitting.options import MIN_PIXELS
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.threads import one_kernel_thread
+from sq_perception.imaging import raycast, regions
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.seen_object import SeenObject, surroundings
+from sq_perception.segmentation import crossings
+from sq_perception.segmentation.convex_pieces import linked
+from sq_perception.segmentation.sampled_image import SampledImage, stride
+
+MOST_PARTS = 4
+_SAMPLES = 120
+"""Samples of an object between which lines are drawn."""
+_LIMITS = (0.55, 0.35, 0.2)
+"""Distances between clusters up to which they are one piece."""
+_METRIC = 0.3
+"""What the metric distance adds to that between samples, at most."""
+_LEAST_SHARE = 0.03
+"""Share of the object's samples that a piece has at least."""
+_THROUGH = 2.0
+"""Deviations of the noise behind a line from which on it is crossed."""
+_WITNESSES = 120.0
+"""N above."""
+_FARTHEST = 3.0
+"""Deviations of the noise beyond which a pixel is not explained."""
+_RAYS = 500
+"""Pixels of an object whose depth is compared, about."""
+_PRICE = 11 / 2 * math.log(_WITNESSES) * 2 / _WITNESSES
+"""What a further body must lessen L by."""
+_OPEN = 0.012
+"""Free pixels that a body covers, as a share of the object's pixels, from which on it is more than one: a body through
+which nothing was seen leaves no room between parts."""
+_JOINT_SPREAD = 2.0
+"""Factor of the covariance of a part: where one ends and the next one begins is not seen."""
+_FINE = 1.3
+"""L of good bodies, mostly: where one leaves no more than the price above it, two are not sought."""
+
+
+class Weight(NamedTuple):
+    """L and m / n above, and the share (k,) of the object's pixels that each body explains."""
+
+    misfit: float
+    through: float
+    shares: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the image says of bodies in an object's place; pixels on a grid around it.
+
+    ``depth`` is NaN where nothing was measured, ``mask`` that of the object, ``sigma`` the noise, metres.
+    """
+
+    depth: np.ndarray
+    mask: np.ndarray
+    camera: Camera
+    sigma: float
+
+    @classmethod
+    def of(cls, obj: SeenObject, depth: np.ndarray, camera: Camera, sigma: float) -> Evidence:
+        rows, columns = obj.mask_crop.shape
+        step = max(1, math.isqrt(int(np.count_nonzero(obj.mask_crop)) // _RAYS))
+        _, near, mask, view = surroundings(obj, depth, obj.mask, camera, max(rows, columns) // 4)
+        near, mask = near[::step, ::step], mask[::step, ::step]
+        fx, fy, cx, cy = (number / step for number in (view.fx, view.fy, view.cx, view.cy))
+        height, width = near.shape
+        view = replace(view, width=width, height=height, fx=fx, fy=fy, cx=cx, cy=cy)
+        return cls(near, mask & np.isfinite(near), view, sigma)
+
+    def weigh(self, fits: Sequence[Fit]) -> Weight:
+        """Compare the bodies of k fits, together, with the image."""
+        with one_kernel_thread():
+            rendered, index = raycast.render(Superquadric.stack([fit.superquadric for fit in fits]), self.camera)
+        off = np.where(np.isfinite(rendered), rendered - self.depth, np.inf) / self.sigma
+        count = max(int(np.count_nonzero(self.mask)), 1)
+        through = np.count_nonzero((off < -_FARTHEST) & ~self.mask) / count
+        misfit = float(np.minimum(off[self.mask] ** 2, _FARTHEST**2).sum()) / count + _FARTHEST**2 * through
+        shown = np.bincount(index[self.mask & (np.abs(off) < _FARTHEST)], minlength=len(fits))
+        return Weight(misfit, through, shown / count)
+
+
+class Search:
+    """The search for the parts of one object: division by division, as long as the description gets shorter."""
+
+    def __init__(self, obj: SeenObject, alone: Fit, depth: np.ndarray, camera: Camera) -> None:
+        self._noise = alone.noise
+        self.parts: Parts | None = None
+        """The best ones so far; None where one body is the shorter description."""
+        self._divisions: Iterator[list[SeenObject]] = iter(())
+        if alone.status == Status.FAILED or not (camera.is_pinhole and np.isfinite(alone.noise)):
+            return
+        self._evidence = Evidence.of(obj, depth, camera, alone.noise)
+        weight = self._evidence.weigh([alone])
+        self._least = weight.misfit
+        if weight.misfit > _FINE + _PRICE and weight.through > _OPEN:
+            pieces = _divide(obj, _THROUGH * alone.noise)
+            self._divisions = (list(_make_objects(obj, depth, camera, each)) for each in pieces)
+
+    def next_pieces(self) -> list[SeenObject]:
+        """Return the pieces of the next division; none where the search has ended."""
+        return next(self._divisions, [])
+
+    def judge(self, fits: Sequence[Fit]) -> None:
+        """Keep the fits of a division's pieces, or end the search if those at hand are the shorter description."""
+        fits = [fit for fit in fits if fit.status != Status.FAILED]
+        if len(fits) > 1:
+            weight = self._evidence.weigh(fits)
+            left = weight.misfit + _PRICE * (len(fits) - 1)
+            if left < self._least:
+                self._least = left
+                milliseconds = sum(fit.milliseconds for fit in fits)
+                fits = [replace(fit, covariance=_JOINT_SPREAD * fit.covariance) for fit in fits]
+                self.parts = Parts.of(fits, weight.shares, self._noise, milliseconds)
+                return
+        self._divisions = iter(())
+
+
+def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
+    """Yield label images (h, w) in the window of an object: its pieces from 1, 0 beside it."""
+    depth = np.where(np.isfinite(obj.depth_crop), obj.depth_crop, np.float32(0))
+    labels = (obj.mask_crop & (depth > 0)).astype(np.int32)
+    extent = regions.extents(labels)[1]
+    image = SampledImage(depth, labels, obj.camera_crop, 0.0)
+    some = image.sampled(1, extent, _SAMPLES)
+    if some is None:
+        return
+    crossed, far = crossings.within(some.pixels, some.points, depth, 0.0, through)
+    apart = crossed + _METRIC * far / max(far.max(), 1e-9)
+    rows, columns = regions.pixels(labels, 1, extent)
+    block = max(1, stride(len(rows), _SAMPLES) // 4)
+    seen = set()
+    for limit in _LIMITS:
+        group = linked(apart, np.ones(len(far)), limit)
+        size = np.bincount(group)
+        is_large = size >= max(4, _LEAST_SHARE * len(far))
+        if not 2 <= np.count_nonzero(is_large) <= MOST_PARTS:
+            continue
+        keep = np.flatnonzero(is_large[group])
+        group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
+        if group.tobytes() in seen:
+            continue
+        seen.add(group.tobytes())
+        shown = depth, image.focal, some.spacing, block, 0.0, through
+        piece = crossings.assigned(rows, columns, some.pixels, some.z, group, int(group.max()) + 1, *shown)
+        divided = np.zeros_like(labels)
+        divided[rows, columns] = piece + 1
+        yield divided
+
+
+def _make_objects(obj: SeenObject, depth: np.ndarray, camera: Camera, pieces: np.ndarray) -> Iterator[SeenObject]:
+    """Make objects of the pieces of an object, in its window; they stand on what it stands on."""
+    for k in range(1, int(pieces.max()) + 1):
+        mask = np.zeros_like(obj.mask)
+        mask[obj.window] = pieces == k
+        x, y, width, height = regions.box(mask)
+        pixels = int(np.count_nonzero(mask))
+        if pixels < MIN_PIXELS:
+            continue
+        window = slice(y, y + height), slice(x, x + width)
+        crop = camera.cropped(x, y, width, height)
+        yield SeenObject(obj.label, pixels, pixels, np.empty(0, int), mask, depth[window], crop, window, obj.plane)
