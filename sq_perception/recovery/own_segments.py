@@ -118,7 +118,7 @@ class SegmentNetwork:
         parts = [] if self.plane is None else self._parted(labels, seen)
         if parts:
             seen |= self._seen(labels, parts)
-        while len(seen) > 1 and (joined := self._joined(labels, seen)):
+        while len(seen) > 1 and (joined := self._join(labels, seen)):
             seen |= self._seen(labels, joined)
         likely = self._things(labels, seen, found.heights)
         outliers = np.zeros(labels.shape, bool)
@@ -152,7 +152,7 @@ class SegmentNetwork:
             parts += _cut(labels, label, seen[label], each)
         return parts
 
-    def _joined(self, labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
+    def _join(self, labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
         """Join pairs that are each other's object, each segment with one other; the labels that remain of them."""
         mutual, order = _mutual(labels, seen), list(seen)
         remain: list[int] = []

@@ -9,14 +9,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import convex_parts
-from sq_perception.segmentation.support_surface import SupportSurface
+from sq_perception.segmentation.support_plane import TOLERANCE
+from sq_perception.segmentation.support_surface import CLEARLY, SupportSurface
 
 LEAST_SIGMA = 5e-4
 """Noise of the depth at one metre that is assumed at least, metres: rendered images have none."""
+_WIDE, _MEASURED = 9, 0.99
+"""Pixels a side of the windows by whose means low things are told from noise, and the share of readings in one that
+tells of the noise."""
 _FOOT_PIXELS = 3
 """Up to which the foot of a thing reaches below what is clearly above the support."""
 _LEAST_AREA = 1e-4
@@ -28,6 +32,7 @@ _GROWN = 3
 _GAP = 0.1
 """Share of the depth by which pixels of a surface with steps in it differ at most: what lies behind a fringe is
 farther."""
+
 
 def above(
     known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
@@ -41,7 +46,9 @@ def above(
     clear = cv2.blur(relative, (3, 3)) > support.clear_height
     # The mean beside a tall body is that of its height: the pixel itself decides there.
     raised = relative > 0.5 * support.clear_height
-    clear &= raised
+    above_noise, low = _low(relative, valid, support.clear_height)
+    clear = (clear & raised) | low
+    raised |= above_noise
     left, top, width, height = regions.box(clear)
     if width == 0:
         return labels
@@ -55,6 +62,26 @@ def above(
     foot = raised[window] & (inside == 0)
     labels[window] = depth_steps.grow(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
+
+
+def _low(relative: np.ndarray, valid: np.ndarray, clear_height: float) -> tuple[np.ndarray, np.ndarray]:
+    """What single readings hide in their noise, as pixels (height, width): those above the support by the median of
+    their neighbours, and of them those that the mean of a wide window shows to be clearly above it.
+
+    The deviation of such means is that of windows side by side on the support, which is most of what is not clearly
+    above it: it holds what correlated noise and waves of the depth leave of a mean.
+    """
+    # What is higher counts as if it were just clear, so that tall bodies do not raise what is beside them.
+    wide = cv2.blur(np.minimum(relative, clear_height), (_WIDE, _WIDE))
+    share = cv2.blur(valid.astype(np.float32), (_WIDE, _WIDE))
+    apart = slice(_WIDE // 2, None, _WIDE)
+    means = np.abs(wide[apart, apart])[share[apart, apart] > _MEASURED]
+    means = means[means < clear_height]
+    if not means.size:
+        return np.zeros(valid.shape, bool), np.zeros(valid.shape, bool)
+    height = max(0.5 * TOLERANCE, CLEARLY * MEDIAN_TO_SIGMA * quantile(means, 0.5))
+    near = valid & (cv2.medianBlur(relative, 3) > 0.5 * height)
+    return near, near & (wide > height)
 
 
 def taken_apart(depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:

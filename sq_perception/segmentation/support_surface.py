@@ -36,6 +36,8 @@ _ROUNDS = 6
 """Rounds of reweighting, at most: it ends when it is settled."""
 _TERMS = 6
 """Coefficients of a quadratic surface."""
+CLEARLY = 4.0
+"""Standard deviations of the noise from which on a height is none of it."""
 _DISTORTION = 0.02
 """Makers of depth cameras promise an error of at most 2 % of the depth."""
 
@@ -67,7 +69,7 @@ class SupportSurface:
 
         Half of the tolerance is a compromise: bent depth of real cameras stays below, thin objects stay above.
         """
-        return max(0.5 * TOLERANCE, 4 * self.sigma)
+        return max(0.5 * TOLERANCE, CLEARLY * self.sigma)
 
     def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
         """Height, float32 (height, width), above the bent surface as at one metre of depth, 0 for depth 0; of a pinhole
