@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
@@ -16,7 +17,16 @@ from sq_msgs.msg import GraspArray, Superquadric, SuperquadricArray
 from sq_msgs.srv import PlanGrasps, Recover
 from sq_msgs_py import superquadrics
 from sq_msgs_py.interfaces import superquadric_array
+from sq_perception.grasping import planner
 from sq_perception.nodes.grasp_node import GraspNode
+from sq_perception.tracking import association
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    """Kernels that have to be compiled first would take longer than a bench is patient."""
+    association.warm_up()
+    planner.warm_up()
 
 
 def bodies(count: int = 2) -> superquadrics.SuperquadricArray:
