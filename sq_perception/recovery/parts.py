@@ -33,7 +33,7 @@ from sq_perception.geometry.threads import one_kernel_thread
 from sq_perception.imaging import raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
-from sq_perception.segmentation import crossings
+from sq_perception.segmentation import line_of_sight
 from sq_perception.segmentation.convex_pieces import linked
 from sq_perception.segmentation.sampled_image import SampledImage, stride
 
@@ -153,7 +153,7 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
     some = image.sampled(1, extent, _SAMPLES)
     if some is None:
         return
-    crossed, far = crossings.within(some.pixels, some.points, depth, 0.0, through)
+    crossed, far = line_of_sight.within(some.pixels, some.points, depth, 0.0, through)
     apart = crossed + _METRIC * far / max(far.max(), 1e-9)
     rows, columns = regions.pixels(labels, 1, extent)
     block = max(1, stride(len(rows), _SAMPLES) // 4)
@@ -170,7 +170,7 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
             continue
         seen.add(group.tobytes())
         shown = depth, image.focal, some.spacing, block, 0.0, through
-        piece = crossings.assigned(rows, columns, some.pixels, some.z, group, int(group.max()) + 1, *shown)
+        piece = line_of_sight.assigned(rows, columns, some.pixels, some.z, group, int(group.max()) + 1, *shown)
         divided = np.zeros_like(labels)
         divided[rows, columns] = piece + 1
         yield divided
