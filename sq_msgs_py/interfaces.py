@@ -12,34 +12,33 @@ from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.poses import poses_at
 from sq_msgs_py.superquadrics import SuperquadricArray
 
-_AS_THEY_ARE = ("id", "label", "status", "reason", "seen", "score", "residual", "objectness")
+_AS_THEY_ARE = ("id", "label", "status", "reason", "seen", "part", "score", "residual", "objectness")
 """Columns that are fields of the same name."""
 
 
 def superquadric_array(
     bodies: SuperquadricArray,
-    covariances: np.ndarray | None,
+    covariances: np.ndarray,
     header: Any,
-    parts: SuperquadricArray | None = None,
+    parts: SuperquadricArray,
     types: MessageTypes = installed,
 ) -> Any:
-    """The sq_msgs/SuperquadricArray of bodies (n,) with covariances (n, 6, 6) of their poses, None or NaN: unknown.
+    """Return the sq_msgs/SuperquadricArray of bodies (n,), covariances (n, 6, 6) of their poses, and their parts.
 
     Raises
     ------
     ImportError
         Where sq_msgs is not built.
     """
-    some = None if parts is None or not len(parts) else parts
     return types("sq_msgs/msg/SuperquadricArray")(
         header=header,
         superquadrics=_superquadrics(bodies, covariances, types),
-        parts=[] if some is None else _superquadrics(some, None, types),
+        parts=_superquadrics(parts, np.full((len(parts), 6, 6), np.nan), types),
     )
 
 
 def grasp_array(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> Any:
-    """The sq_msgs/GraspArray of grasps.  Raises ImportError as :func:`superquadric_array` does."""
+    """Return the sq_msgs/GraspArray of grasps.  Raises ImportError as :func:`superquadric_array` does."""
     kind = types("sq_msgs/msg/Grasp")
     found = [
         kind(pose=pose, **{name: getattr(grasps, name)[k].item() for name in ("id", "opening", "width", "score")})
@@ -48,19 +47,18 @@ def grasp_array(grasps: GraspArray, header: Any, types: MessageTypes = installed
     return types("sq_msgs/msg/GraspArray")(header=header, grasps=found)
 
 
-def _superquadrics(bodies: SuperquadricArray, covariances: np.ndarray | None, types: MessageTypes) -> list[Any]:
+def _superquadrics(bodies: SuperquadricArray, covariances: np.ndarray, types: MessageTypes) -> list[Any]:
     kind, posed, vector = (
-        types(f"{name}")
+        types(name)
         for name in ("sq_msgs/msg/Superquadric", "geometry_msgs/msg/PoseWithCovariance", "geometry_msgs/msg/Vector3")
     )
-    known = np.full((len(bodies), 6, 6), np.nan) if covariances is None else covariances
 
     def xyz(numbers: Sequence[float]) -> Any:
         return vector(**dict(zip("xyz", numbers, strict=True)))
 
     return [
         kind(
-            pose=posed(pose=pose, covariance=known[k].ravel().tolist()),
+            pose=posed(pose=pose, covariance=covariances[k].ravel().tolist()),
             half_size=xyz(bodies.size[k].tolist()),
             sigma_half_size=xyz(bodies.sigma_size[k].tolist()),
             exponents=bodies.shape[k].tolist(),

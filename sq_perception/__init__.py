@@ -13,8 +13,8 @@ from sq_perception.files.version import __version__
 
 if TYPE_CHECKING:
     from sq_perception.evaluation.recovery_figure import recovery_figure
-    from sq_perception.fitting.decomposition import Parts, decompose
-    from sq_perception.fitting.fit import Fit, Status
+    from sq_perception.fitting.decomposition import decompose
+    from sq_perception.fitting.fit import Fit, Parts, Status
     from sq_perception.fitting.options import FitOptions
     from sq_perception.fitting.points import fit_mesh, fit_points
     from sq_perception.fitting.surface_fit import fit
@@ -61,7 +61,7 @@ _HOMES = {
     "Fit": "fitting.fit",
     "FitOptions": "fitting.options",
     "FrameRecovery": "recovery.recoverer",
-    "Parts": "fitting.decomposition",
+    "Parts": "fitting.fit",
     "RecordedFrame": "recordings.frame_file",
     "Recoverer": "recovery.recoverer",
     "Recovery": "recovery.recoverer",

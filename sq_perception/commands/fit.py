@@ -90,8 +90,8 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]:
-    from sq_perception.fitting.decomposition import Parts, decompose
-    from sq_perception.fitting.fit import Fit
+    from sq_perception.fitting.decomposition import decompose
+    from sq_perception.fitting.fit import Fit, Parts
     from sq_perception.fitting.points import fit_points, surface_of
 
     points, normals = surface_of(surface)

@@ -76,5 +76,5 @@ class RecoverInterfaces:
     async def _answer(self, answer: Any) -> Any:
         answer.success, answer.message, found = await self._outcomes()
         if found is not None:
-            answer.bodies = superquadric_array(found.array, found.covariances, found.header)
+            answer.bodies = superquadric_array(found.array, found.covariances, found.header, found.parts)
         return answer

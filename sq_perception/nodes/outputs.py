@@ -147,7 +147,7 @@ class Outputs:
         """Publish the other outputs and note the time of each stage.  Errors are only logged."""
         try:
             if self.array is not None and self.array.get_subscription_count():
-                self.array.publish(superquadric_array(shown.array, shown.covariances, shown.header))
+                self.array.publish(superquadric_array(shown.array, shown.covariances, shown.header, shown.parts))
             with timed(stages, "outputs"):
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message, serialize_message
@@ -44,22 +46,22 @@ def same(found: Superquadric, array: superquadrics.SuperquadricArray, k: int) ->
     np.testing.assert_array_equal([size.x, size.y, size.z], array.size[k])
     np.testing.assert_array_equal(found.exponents, array.shape[k])
     np.testing.assert_array_equal(found.taper, array.taper[k])
-    for name in ("id", "label", "status", "reason", "seen", "fused", "score", "residual", "objectness"):
+    for name in ("id", "label", "status", "reason", "seen", "part", "fused", "score", "residual", "objectness"):
         np.testing.assert_array_equal(getattr(found, name), getattr(array, name)[k], name)
 
 
 def test_a_message_holds_every_number_of_the_cloud_the_covariances_and_parts():
     array, header = bodies(), Header(frame_id="camera")
     covariances = np.random.default_rng(4).random((2, 6, 6))
-    sent = superquadric_array(array, covariances, header, parts=array.where(array.id == 8))
+    sent = superquadric_array(array, covariances, header, replace(array, part=np.array([1, 2])))
     message = deserialize_message(serialize_message(sent), SuperquadricArray)
     for k in range(2):
         same(message.superquadrics[k], array, k)
         np.testing.assert_array_equal(message.superquadrics[k].pose.covariance, covariances[k].ravel())
         assert np.isnan(message.superquadrics[k].sigma_exponents).all(), "not known"
-    (part,) = message.parts
-    same(part, array, 1)
-    assert np.isnan(part.pose.covariance).all()
+    for k, part in enumerate(message.parts):
+        same(part, replace(array, part=np.array([1, 2])), k)
+        assert np.isnan(part.pose.covariance).all()
     names = {name: value for name, value in vars(superquadrics).items() if name in ("CONVERGED", "WEAK", "FAILED")}
     names |= {one.name: int(one) for one in superquadrics.Reason}
     assert {name: getattr(Superquadric, name) for name in names} == names, "the constants are those of the cloud"
