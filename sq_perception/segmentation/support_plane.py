@@ -156,9 +156,11 @@ def around(
     if np.count_nonzero(near) < 30:
         return None
     if known is not None:
-        points = _some_points(depth, near, camera, _PLANE_POINTS)
-        off = np.abs(points @ known[:3] + known[3]) >= TOLERANCE * noise_growth(points[:, 2])
-        if np.count_nonzero(off) < _LEAST_SHARE * len(points):
+        rows, columns = np.nonzero(near)
+        points = camera.unproject(columns, rows, depth[rows, columns])
+        on = np.abs(points @ known[:3] + known[3]) < TOLERANCE * noise_growth(points[:, 2])
+        near[rows[on], columns[on]] = False
+        if np.count_nonzero(~on) < _LEAST_SHARE * len(points):
             return None
     best, best_vote = None, 0.0
     for plane in planes(depth, near, camera):
