@@ -45,7 +45,8 @@ from common.hull_columns import Columns
 from common.scene_verdict import FEWEST_PIXELS, HALF
 from known_frames import camera_of
 
-from sq_perception.fitting import surface_fit, tolerant
+from sq_perception.fitting import course as tolerant
+from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.observation import Observation
@@ -99,7 +100,7 @@ def _support(hull: HullPrior, seen: Seen) -> np.ndarray:
 
 
 def _rays(count: float) -> AbstractContextManager[Any]:
-    return patch.object(tolerant, "INDEPENDENT_OF_PREDICTED", count)
+    return patch.object(tolerant, "INDEPENDENT", count)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.hull_prior import HullPrior, near_axes
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.priors import hull_cost, hull_distances
-from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
+from sq_perception.fitting.rays import DEPTH, SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
@@ -83,7 +83,7 @@ def _information(
     """
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     of_hull = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    cost = evaluate(RENDERED, hits, free, others, parameters, rotation, sums)
+    cost = evaluate(RENDERED, hits, free, others, parameters, rotation, hits[:, DEPTH].copy(), sums)
     variance = max(1.0, cost / hits[:, WEIGHT].sum())
     vaguer = 1.0
     if terms.hull_directions.shape[0] > 0:

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from sq_perception.fitting.cost import LANES, Terms
-from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
+from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
 from sq_perception.geometry.kernels import Form, gauge_derivatives, in_object_frame, inline_kernel, inside_box, kernel
 
 QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)
@@ -43,15 +43,16 @@ _FAR_OUTSIDE = 2.0
 
 
 @kernel
-def place(part: np.ndarray, resume: bool, parameters: np.ndarray, rotation: np.ndarray, lanes: np.ndarray) -> None:
-    """Write object rays, in the object frame, to the lanes; q at the measured depth, or where it met the body last."""
+def place(part: np.ndarray, met: np.ndarray, parameters: np.ndarray, rotation: np.ndarray, lanes: np.ndarray) -> None:
+    """Write object rays, in the object frame, to the lanes; q at the measured depth, or where they met the body before,
+    if any such depths are given."""
     t1, t2, t3 = parameters[5], parameters[6], parameters[7]
     m11, m12, m13 = rotation[0]
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
     for i in range(part.shape[0]):
         dx, dy = part[i, DIRECTION_X], part[i, DIRECTION_Y]
-        start = part[i, LAST] if resume else part[i, DEPTH]
+        start = met[i] if met.shape[0] > 0 else part[i, DEPTH]
         x, y, z = part[i, ORIGIN_X] - t1 + start * dx, part[i, ORIGIN_Y] - t2 + start * dy, start - t3
         lanes[QX, i] = m11 * x + m21 * y + m31 * z
         lanes[QY, i] = m12 * x + m22 * y + m32 * z

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sq_perception.fitting.cost import PARAMETERS, STEP_LENGTH, Terms
+from sq_perception.fitting.rays import DEPTH
 from sq_perception.fitting.residuals import evaluate
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import inline_kernel, kernel
@@ -83,7 +84,8 @@ def minimize(
     held = np.zeros(STEP_LENGTH, dtype=np.bool_)
     next_parameters = parameters.copy()
     next_rotation = rotation.copy()
-    cost = evaluate(stage, rays, free, terms, parameters, rotation, sums)
+    met = rays[:, DEPTH].copy()
+    cost = evaluate(stage, rays, free, terms, parameters, rotation, met, sums)
     damping = _FIRST_DAMPING
     iterations = 0
     while iterations < max_iterations:
@@ -95,7 +97,7 @@ def minimize(
                 if _promised(sums, step) <= tolerance * max(abs(cost), _LEAST_COST):
                     break
                 move(parameters, rotation, step, lower, upper, next_parameters, next_rotation)
-                next_cost = evaluate(stage, rays, free, terms, next_parameters, next_rotation, next_sums)
+                next_cost = evaluate(stage, rays, free, terms, next_parameters, next_rotation, met, next_sums)
                 if next_cost < cost:
                     accepted = True
                     break

@@ -26,6 +26,7 @@ import numpy as np
 
 from sq_perception.fitting import depth_noise
 from sq_perception.fitting.depth_noise import DepthNoise
+from sq_perception.fitting.options import ON_SUPPORT
 from sq_perception.fitting.rays import drawn, through
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps, regions
@@ -44,9 +45,8 @@ _HOLE = 5
 """Width, pixels, up to which holes and notches of the mask are closed: the outline of a convex body has none."""
 _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
 """Pixel widths and noise levels whose sum a depth step between neighbours exceeds where a surface ends."""
-ON_SUPPORT, _FOOT_PIXELS = 0.003, 3
-"""Height, metres, up to which a pixel of a mask may show the support, and width, pixels, of the part of an object's
-foot that is so low."""
+_FOOT_PIXELS = 3
+"""Width, pixels, of the part of an object's foot that is no higher than its support."""
 _BEHIND_SHARE = 0.02
 """Share of a mask's pixels joined to the object by way of its support alone, from which on the mask is too large: by
 one pixel around an object of 150.  One in twenty right masks of benchmarks/household_things has as much, from its

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
 SMALLEST_SIZE = 0.02
@@ -22,6 +23,8 @@ TAPER = 0.8
 """Largest taper of a fit, where bodies may taper: beyond, a bottle would be a cone."""
 MIN_PIXELS = 12
 """Fewest pixels of an object with a depth: a body has 11 parameters."""
+ON_SUPPORT = 0.003
+"""Height, metres, up to which a pixel of a mask may show the support."""
 MODEL_ERROR = 0.0025
 """How far real objects stray from superquadrics on tables of everyday things, metres."""
 
@@ -35,6 +38,21 @@ def limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     lower = np.array([*[smallest] * 3, *[EXPONENTS[0]] * 2, *(low - reach), 0.0, 0.0])
     upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(high + reach), 0.0, 0.0])
     return lower, upper
+
+
+class PlaneError(ValueError):
+    """A support plane that most of the object lies behind."""
+
+
+def check_plane(points: np.ndarray, plane: np.ndarray | None) -> None:
+    """Raise PlaneError if most of the object's points (n, 3) lie behind its support, as where its normal's sign is
+    wrong."""
+    if plane is None:
+        return
+    height = quantile(points @ plane[:3] + plane[3], 0.5)
+    if height < -ON_SUPPORT:
+        turned = "is it what this object stands on, and does its normal n point away from that?"
+        raise PlaneError(f"plane: expected one under the object, got one {-height:.3g} m above it: {turned}")
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,14 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.multistart import SETTLE, Problem
 from sq_perception.fitting.observation import BAND_PIXELS
-from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, FIRST_STEPS, Problem
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import penetration
 from sq_perception.geometry.quantiles import quantile
 
+_RAYS, _STEPS = 3000, 5
+"""Rays that tell whether a mask shrank, and steps of a body once its outline is read."""
 _SHARP = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels, a
 uniform error of up to half a pixel (1 / sqrt(12))."""
@@ -34,7 +36,7 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
     if _depth_inside(problem, state, full.ring(1)) < _SHRUNK:
         return problem, state
     problem = replace(problem, observation=full.beyond(BAND_PIXELS))
-    state = problem.refine(state, problem.draw(FINAL_RAYS, 0.6), BASIN_STEPS)
+    state = problem.refine(state, problem.draw(_RAYS, 0.6), SETTLE.steps)
     rings = (k for k in range(1, BAND_PIXELS + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
     band = next(rings, BAND_PIXELS + 1) - 1
     return replace(problem, observation=full.beyond(band) if band > 0 else full), state
@@ -52,7 +54,7 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
-        state = problem.settle(state, rays, FIRST_STEPS)
+        state = problem.settle(state, rays, _STEPS)
         before, sigma = sigma, _sigma(problem, state, free)
 
 

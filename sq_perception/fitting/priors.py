@@ -5,7 +5,8 @@ gap         as ``plane`` where positive, another sigma, Cauchy: bodies do not ho
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
-roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
+roundness   log(a1 / a2) and 1 - e2, over sigma, both together bivariate Cauchy: most bodies are of revolution about z,
+            and those that are not are so by any amount.
 hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions against a predicted one b, whitened by
             W^T W, the inverse of its covariance (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).
 taper       k_x and k_y over their standard deviation: most things do not taper.
@@ -189,11 +190,13 @@ def _expectation_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) ->
 @kernel
 def _roundness_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
     s = terms.roundness_stiffness
-    row = np.zeros(STEP_LENGTH + 1)
     oval = s * (math.log(parameters[0]) - math.log(parameters[1]))
-    row[0], row[1], row[STEP_LENGTH] = s, -s, oval
-    add_row(row, sums)
     square = s * (1.0 - parameters[4])
-    row[0], row[1], row[4], row[STEP_LENGTH] = 0.0, 0.0, -s, square
+    above = 1.0 + oval * oval + square * square
+    scale = math.sqrt(3.0 / above)
+    row = np.zeros(STEP_LENGTH + 1)
+    row[0], row[1], row[STEP_LENGTH] = scale * s, -scale * s, scale * oval
     add_row(row, sums)
-    return oval * oval + square * square
+    row[0], row[1], row[4], row[STEP_LENGTH] = 0.0, 0.0, -scale * s, scale * square
+    add_row(row, sums)
+    return 3.0 * math.log(above)

@@ -9,8 +9,8 @@ import numpy as np
 
 from sq_perception.fitting.covariance import carried_over, spread, undetermined
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
+from sq_perception.fitting.multistart import Solution
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
-from sq_perception.fitting.problem import Solution
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric

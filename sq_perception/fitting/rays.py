@@ -13,14 +13,13 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Lens
 
-ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, DEPTH, STIFFNESS, WEIGHT, LAST = range(8)
+ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, DEPTH, STIFFNESS, WEIGHT = range(7)
 """Columns of a ray.
 
 DEPTH, metres: what the pixel measured; for a free ray, up to where its space is empty.  STIFFNESS, 1 / metres:
-1 / sigma of the depth; 1 for a free ray, whose sigma is the outline's.  WEIGHT: as how many rays it counts.  LAST,
-metres: where the ray met the body last time, which is where the next search for the intersection starts.
+1 / sigma of the depth; 1 for a free ray, whose sigma is the outline's.  WEIGHT: as how many rays it counts.
 """
-RAY_COLUMNS = 8
+RAY_COLUMNS = 7
 SAMPLE = 800
 """Object rays that determine a mean, a share or a median to 1 to 3 %, and take a tenth of a fit's time."""
 
@@ -29,9 +28,9 @@ class Rays(NamedTuple):
     """The rays that one stage of a fit draws."""
 
     hits: np.ndarray
-    """Rays (n, 8) of the object's pixels."""
+    """Rays (n, 7) of the object's pixels."""
     free: np.ndarray
-    """Rays (m, 8) of pixels beside the object."""
+    """Rays (m, 7) of pixels beside the object."""
 
     @property
     def weight(self) -> float:
@@ -80,7 +79,7 @@ def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> n
 def through(
     pixels: np.ndarray, depth: np.ndarray, lens: Lens, noise: float, model_error: float, margin: float
 ) -> np.ndarray:
-    """Rays (n, 8) through pixels, indices into the depth image; free ones end a margin before the reading.
+    """Rays (n, 7) through pixels, indices into the depth image; free ones end a margin before the reading.
 
     Noise and model error join in squares; ``margin``: in such standard deviations, 0 for rays of the object.
     """
@@ -100,7 +99,7 @@ def through(
         if not np.isfinite(z):
             rays[i, DEPTH] = 1e300
             continue
-        rays[i, DEPTH] = rays[i, LAST] = z - margin * sigma
+        rays[i, DEPTH] = z - margin * sigma
         if margin == 0.0:
             rays[i, STIFFNESS] = 1.0 / sigma
     return rays

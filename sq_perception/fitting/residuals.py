@@ -67,7 +67,7 @@ from sq_perception.fitting.intersection import (
     place,
 )
 from sq_perception.fitting.priors import prior_cost
-from sq_perception.fitting.rays import LAST, STIFFNESS
+from sq_perception.fitting.rays import STIFFNESS
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
@@ -84,11 +84,13 @@ def evaluate(
     terms: Terms,
     parameters: np.ndarray,
     rotation: np.ndarray,
+    met: np.ndarray,
     sums: np.ndarray,
 ) -> float:
     """Cost at a body; fills ``sums`` (14, 14), lower triangle: J^T J in rows 0 to 12, J^T r in row 13.
 
-    The RENDERED stage keeps in the column LAST of ``rays`` where each ray met the body.
+    ``met`` (n,) are the depths where the rays met a body nearby, the measured ones at first: the RENDERED stage begins
+    there to look for the intersection, and writes where it is.
     """
     sums[:] = 0.0
     block = np.empty((STEP_LENGTH + 1, LANES))
@@ -98,11 +100,12 @@ def evaluate(
     cost = 0.0
     for begin in range(0, rays.shape[0], LANES):
         part = rays[begin : begin + LANES]
-        place(part, stage == RENDERED, parameters, rotation, lanes)
+        before = met[begin : begin + LANES] if stage == RENDERED else met[:0]
+        place(part, before, parameters, rotation, lanes)
         filled = padded(part.shape[0], lanes)
         if stage == RENDERED:
             meet(filled, terms.hit_tolerance, parameters, lanes, missed, again)
-            cost += _rendered_rows(filled, part, terms, lanes, missed, block)
+            cost += _rendered_rows(filled, before, terms, lanes, missed, block)
         else:
             gauge_along(filled, parameters, lanes)
             cost += _measured_rows(filled, stage, terms, parameters, lanes, block)
@@ -136,7 +139,7 @@ def _loss(residual: float, huber: float, terms: Terms, weight: float) -> tuple[f
 
 @kernel
 def _rendered_rows(
-    filled: int, part: np.ndarray, terms: Terms, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray
+    filled: int, met: np.ndarray, terms: Terms, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray
 ) -> float:
     """Cost of rendered and covered residuals; writes their scale and value to the block's first and last row."""
     cost = 0.0
@@ -158,9 +161,9 @@ def _rendered_rows(
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
-    for i in range(part.shape[0]):
+    for i in range(met.shape[0]):
         reached = lanes[START, i] + lanes[SHIFT, i] - (lanes[G, i] - 1.0) / lanes[SLOPE, i]
-        part[i, LAST] = lanes[MEASURED, i] if missed[i] else reached
+        met[i] = lanes[MEASURED, i] if missed[i] else reached
     return cost
 
 
@@ -242,7 +245,7 @@ def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndar
     lanes = np.empty((ROWS, LANES))
     for begin in range(0, rays.shape[0], LANES):
         part = rays[begin : begin + LANES]
-        place(part, False, parameters, rotation, lanes)
+        place(part, distance[:0], parameters, rotation, lanes)
         gauge_along(padded(part.shape[0], lanes), parameters, lanes)
         for i in range(part.shape[0]):
             gx, gy, gz = lanes[GX, i], lanes[GY, i], lanes[GZ, i]

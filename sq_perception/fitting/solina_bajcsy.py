@@ -31,7 +31,7 @@ from sq_perception.fitting.cost import Terms
 from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.options import MIN_PIXELS, limits
-from sq_perception.fitting.rays import DEPTH, LAST, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
+from sq_perception.fitting.rays import DEPTH, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
 from sq_perception.fitting.residuals import CLASSIC
 from sq_perception.fitting.starts import on_one_line
 from sq_perception.geometry import rotation as quaternions
@@ -90,7 +90,7 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
     if not reason:
         rays = np.zeros((len(points), RAY_COLUMNS))
         rays[:, ORIGIN_X], rays[:, ORIGIN_Y], rays[:, DEPTH] = points.T
-        rays[:, STIFFNESS], rays[:, WEIGHT], rays[:, LAST] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
+        rays[:, STIFFNESS], rays[:, WEIGHT] = 1 / (_UNIT * extent**1.5), 1.0
         bounds, terms = limits(points), Terms(huber=math.inf)
         state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, bounds, _MOST_STEPS, _TOLERANCE)
         rng = np.random.default_rng(0)

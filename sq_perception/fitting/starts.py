@@ -260,3 +260,51 @@ def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: 
         size = np.sqrt(np.maximum(spread, 1e-12) / MOMENT_SHARE)
         found.append(State(np.concatenate([size, [exponent, exponent], centre, [0.0, 0.0]]), rotation, math.inf, 0))
     return found
+
+
+# Rivals of a body at hand
+
+
+def other_depths(state: State, axis: int) -> list[State]:
+    """The body with half of its half size along an axis, with more of it, and turned."""
+    size = state.parameters[axis]
+    return [resized(state, axis, 0.5 * size), resized(state, axis, 1.4 * size), _turned(state)]
+
+
+def _turned(state: State) -> State:
+    """The body turned by 45 degrees about its z: a square cross-section and a round one are hard to distinguish."""
+    parameters = state.parameters.copy()
+    parameters[:2] = math.sqrt(0.5 * (parameters[0] ** 2 + parameters[1] ** 2))
+    parameters[4] = START_EXPONENT
+    turned = eighth_turns(state.rotation)[2]
+    return State(parameters, np.ascontiguousarray(turned), math.inf, state.iterations)
+
+
+def other_orders(state: State) -> list[State]:
+    """Bodies of the same box with each of its other axes as z."""
+    found = []
+    for order in three_orders(np.eye(3))[:2]:
+        parameters = state.parameters.copy()
+        parameters[:3] = order.T @ parameters[:3]
+        parameters[3:5] = START_EXPONENT
+        found.append(State(parameters, np.ascontiguousarray(state.rotation @ order), math.inf, state.iterations))
+    return found
+
+
+def other_axes(state: State) -> list[State]:
+    """Bodies of the same moments with each axis as z, and turned by 45 degrees about each axis."""
+    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * MOMENT_SHARE) @ state.rotation.T
+    found: list[State] = []
+    for axes in [state.rotation, *eighth_turns(state.rotation)]:
+        found += states(state.parameters[5:8], moments, axes)
+    return found
+
+
+def resized(state: State, axis: int, size: float) -> State:
+    """The body with another half size along one of its axes; the face towards the camera stays in place."""
+    parameters = state.parameters.copy()
+    direction = state.rotation[:, axis]
+    away = 1.0 if direction @ parameters[5:8] > 0 else -1.0
+    parameters[5:8] += away * (size - parameters[axis]) * direction
+    parameters[axis] = size
+    return State(parameters, state.rotation, math.inf, state.iterations)

@@ -2,23 +2,21 @@
 
 Residuals run along the true rays of the pixels, so that one code serves orthographic and pinhole cameras: the object's
 pixels pull the surface onto what they measured, the pixels beside the object keep the body out of the space they saw to
-be empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.problem` for a fit
-as data, and :mod:`sq_perception.fitting.quality` for the status and accuracy of the result.
+be empty.  docs/surface_fit.md derives the cost; :mod:`sq_perception.fitting.course` has its two models of an object,
+:mod:`sq_perception.fitting.valleys` what other bodies the image allows.
 
-Which course fits
------------------
-There are two courses, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant`.  If a model error
-is given, it decides: exact for 0, tolerant otherwise.  If none is given, what is known of the object decides:
+Which model
+-----------
+If a model error is given, it decides: a superquadric for 0, a thing otherwise.  If none is given, both are held to be
+equally probable, as far as the image does not tell:
 
-thing       It stands on a plane, or its hull is predicted: tolerant, unless a cheap exact search finds a body that
-            leaves no more than the noise: before, where readings are fine or no plane is known, else after, from the
-            tolerant course's body.  That one stays as another body that the image allows.
-may stray   Neither, but a pinhole camera saw it, and noise may hide how far it strays from a superquadric: exact; a
-            body that leaves more than the noise is passed on to the tolerant course.
-else        Such as the bodies of the thesis: exact.
+- An object that stands on a plane, or whose hull is predicted, is fitted as a thing.  If that leaves less than the
+  noise, or the noise is too fine to hide anything, a superquadric is sought from there.  One that leaves no more than
+  the noise is the result, the thing's body another one that the image allows.
+- Any other is fitted as a superquadric, and as a thing where that leaves more than the noise; the thing strays by what
+  it left.
 
-Objects of the first two kinds get the standard deviations of things, whichever course found their bodies; but for
-those that an orthographic camera shows and the exact course explains: renderings, without noise.
+What a camera sees has the standard deviations of things, whichever model its body is of.
 
 Frames and units: optical frame, metres, radians.
 """
@@ -34,14 +32,14 @@ from typing import Literal
 
 import numpy as np
 
-from sq_perception.fitting import exact, starts, tolerant
+from sq_perception.fitting import course, starts, valleys
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.multistart import Problem, Solution
 from sq_perception.fitting.observation import Crop, Observation
-from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
-from sq_perception.fitting.problem import Problem, Solution
+from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, check_plane
 from sq_perception.fitting.quality import assessed, failed
 from sq_perception.geometry.quantiles import deviation
 from sq_perception.geometry.superquadric import Superquadric
@@ -63,6 +61,10 @@ _NOISE_ALONE = 1.06
 """Mean squared residual up to which a thing is taken for a superquadric.  19 in 20 superquadrics under independent
 noise left less.  Things that left more got worse bodies from the exact course; under a time-of-flight camera, which
 mixes depths at edges, nearly all do."""
+_UNFINISHED = 1.06
+"""Mean squared residual up to which a search that the time budget ended has come near the noise.  Of 30 bodies of the
+thesis' protocol and 120 on tables, all but one in thirty below it erred by less than three standard deviations, and
+nine in ten above it by more, typically by 5 to 40."""
 _AS_A_THING = 0.5
 """Weight of the tolerant course's body as an alternative to an exact one: a thing that a superquadric explains may
 stray from one where nothing was seen, or by less than the noise.  Chosen: on 217 things of benchmarks/household_things
@@ -113,9 +115,9 @@ def fit(
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     task = _Task(depth, mask, camera, crop, options, given, later, began)
-    solution = _undecided(task) if options.model_error is None else _solved(task, options)
+    solution = _solved(task)
     if solution is None:
-        observation = task.observed(options)
+        observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
         body = starts.enclosing_box(observation.points, observation.footprint)
         return failed(body, observation, _hopeless(observation), began)
     return assessed(solution, began)
@@ -123,7 +125,7 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """An object to fit, and what the choice of its course depends on.
+    """An object to fit.
 
     Attributes
     ----------
@@ -161,98 +163,88 @@ class _Task:
         return min(MODEL_ERROR, _MODEL_SHARE * self.crop.footprint * math.sqrt(np.count_nonzero(self.crop.mask)))
 
     @property
-    def of_things(self) -> FitOptions:
-        """The options for a thing."""
-        return replace(self.options, model_error=self.model_error)
-
-    @property
     def is_fine(self) -> bool:
         """Whether the noise is too small to hide how far things stray."""
         return self.crop.noise.sigma < _FINE_NOISE * self.model_error
-
-    @property
-    def may_stray(self) -> bool:
-        """Whether the object may be a thing though the caller does not say so, as most objects before a camera are."""
-        return self.camera.is_pinhole and not self.is_fine and not self.fills_image
 
     @cached_property
     def fills_image(self) -> bool:
         """Whether the object is all that was measured, as the unit cube's bodies and walls before a camera are."""
         return fills(box(self.mask), np.isfinite(self.depth) & (self.depth > 0))
 
-    def observed(self, options: FitOptions) -> Observation:
-        return self.crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
+    def problem(self, model_error: float) -> Problem | None:
+        """The problem of an object that strays so far; None if no body can be fitted to it."""
+        observation = self.crop.observed(model_error, self.options.nan_is_empty, self.options.plane)
+        if _hopeless(observation):
+            return None
+        check_plane(observation.points, self.options.plane)
+        return course.problem_of(observation, self.options, self.began + self.options.time_budget)
 
 
-def _undecided(task: _Task) -> Solution | None:
-    """The solution by the course that explains the object, see the module; None if no body can be fitted to it."""
-    options = task.options
-    exact_first = task.later is not None if options.plane is None else task.is_fine
-    if exact_first:
-        exactly = _exactly(task, task.given, task.later)
-        if exactly is not None and not (task.may_stray or (task.camera.is_pinhole and task.is_thing())):
-            return exactly
-        if (thing := _as_thing(exactly)) is not None:
-            strayed = _solved(task, task.of_things) if task.is_thing() else None
-            return thing if strayed is None else _or_else(thing, strayed.state)
-    if not task.is_thing():
-        solution = _solved(task, options)
-        if solution is not None and task.may_stray:
-            return _as_thing(solution) or _strayed(task, solution)
-        return solution
-    # Tolerant first, without a plane too: an exact search from all starts takes six times as long and gains nothing
-    # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
-    solution = _solved(task, task.of_things)
-    was_tried = options.plane is not None and task.is_fine
-    if solution is None or was_tried or not _is_explained(solution, task.crop.noise.sigma):
-        return solution
-    exactly = _as_thing(_exactly(task, [solution.state, *task.starts()], None))
-    return solution if exactly is None else _or_else(exactly, solution.state)
+def _solved(task: _Task) -> Solution | None:
+    """The solution by the model that the image prefers, see the module; None if no body can be fitted to it."""
+    given = task.options.model_error
+    if given is not None:
+        return _as_thing(task, given, task.starts()) if given else _exactly(task, [])
+    if task.is_thing():
+        thing = _as_thing(task, task.model_error, task.starts())
+        if thing is None or thing.problem.late or not (task.is_fine or _is_explained(thing, task.crop.noise.sigma)):
+            return thing
+        exactly = _exactly(task, [thing.state], patient=False)
+        if exactly is None or exactly.misfit >= _NOISE_ALONE:
+            return thing
+        more = (*exactly.alternatives, Alternative(thing.state, _AS_A_THING))
+        return replace(exactly, alternatives=more, spread_factor=course.SPREAD)
+    exactly = _exactly(task, [])
+    if exactly is None or exactly.problem.late:
+        return exactly
+    may_stray = task.camera.is_pinhole and not task.is_fine and not task.fills_image
+    if exactly.misfit < (_NOISE_ALONE if may_stray else course.EXPLAINS):
+        return replace(exactly, spread_factor=course.SPREAD) if may_stray else exactly
+    left = deviation(np.abs(exactly.distances))
+    return _as_thing(task, task.model_error if may_stray else left, [exactly.state, *task.starts()])
 
 
-def _solved(task: _Task, options: FitOptions) -> Solution | None:
-    """The solution by the course for the model error of the options; None if no body can be fitted."""
-    observation = task.observed(options)
-    if _hopeless(observation):
+def _as_thing(task: _Task, model_error: float, starts_: list[State]) -> Solution | None:
+    """The most probable body of a thing, from given bodies and boxes."""
+    problem = task.problem(model_error)
+    if problem is None:
         return None
-    course = tolerant if options.model_error else exact
-    return course.solve(Problem.of(observation, options, task.began), task.starts())
+    points, plane = problem.observation.points, task.options.plane
+    boxes = starts.principal(points, deeper=False) if plane is None else starts.on_plane(points, plane)
+    solution = course.thing(problem, [*starts_, *boxes])
+    if problem.hull is None and not problem.late:
+        solution = valleys.or_oval(valleys.weighed(solution))
+    return solution if problem.late else valleys.with_open_ends(solution)
 
 
-def _exactly(task: _Task, given: list[State], later: Callable[[], list[State]] | None) -> Solution | None:
-    """The exact solution that explains the image down to its noise; None if a cheap search finds none."""
-    options = replace(task.options, model_error=0.0)
-    observation = task.observed(options)
-    if _hopeless(observation):
+def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution | None:
+    """The best superquadric; if not ``patient``, None where its cheapest starts explain the image not."""
+    problem = task.problem(0.0)
+    if problem is None:
         return None
-    return exact.solve_cheaply(Problem.of(observation, options, task.began), given, later)
-
-
-def _as_thing(exactly: Solution | None) -> Solution | None:
-    """The exact solution with the standard deviations of things; None if it leaves more than the noise."""
-    if exactly is None or exactly.state.cost >= _NOISE_ALONE * exactly.rays.weight:
+    observation = problem.observation
+    groups: list[Callable[[], Sequence[State]]] = [lambda: [*first, *task.given]]
+    symmetric = starts.groups(observation)
+    groups.append(lambda: next(symmetric))
+    if task.later is not None:
+        groups.append(task.later)
+    if patient:
+        groups += [lambda: next(symmetric, [])] * 3
+        groups.append(lambda: starts.everything(observation))
+    solution = course.exact(problem, groups, patient)
+    if solution is None:
         return None
-    return replace(exactly, spread_factor=tolerant.SPREAD)
-
-
-def _strayed(task: _Task, exactly: Solution) -> Solution:
-    """The tolerant solution for an object of which the exact course left more than the noise."""
-    problem = exactly.problem
-    if problem.independent is not None or problem.late:  # the tolerant course was reached already, or time is up
-        return replace(exactly, spread_factor=tolerant.SPREAD)
-    options = task.of_things
-    strayed = replace(Problem.of(task.observed(options), options, 0.0), deadline=problem.deadline)
-    return tolerant.solve(strayed, [exactly.state, *task.starts()])
+    for step in (valleys.explored, valleys.along_view, valleys.with_open_ends, valleys.weighed):
+        if solution.problem.late or solution.misfit > course.EXPLAINS:
+            break
+        solution = step(solution)
+    return replace(solution, is_unfinished=solution.problem.late and solution.misfit > _UNFINISHED)
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a tolerant solution leaves less than the noise, so that an exact one may exist."""
     return deviation(np.abs(solution.distances)) < noise
-
-
-def _or_else(exactly: Solution, thing: State) -> Solution:
-    """The exact solution, with the tolerant course's body as another one that the image allows."""
-    return replace(exactly, alternatives=(*exactly.alternatives, Alternative(thing, _AS_A_THING)))
 
 
 def warm_up() -> None:

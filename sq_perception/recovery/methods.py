@@ -9,8 +9,7 @@ import numpy as np
 
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
-from sq_perception.fitting.problem import PlaneError
+from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, PlaneError
 from sq_perception.fitting.rays import SAMPLE
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement

@@ -12,7 +12,7 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from sq_perception.fitting.observation import ON_SUPPORT
+from sq_perception.fitting.options import ON_SUPPORT
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import canonical_view, depth_steps, lens, regions
 from sq_perception.imaging.camera import Camera

@@ -15,7 +15,7 @@ from sq_perception.fitting.hull_prior import MODEL_SHARE, PULL_SHARE, HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize, move
 from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.priors import prior_cost
-from sq_perception.fitting.rays import Rays
+from sq_perception.fitting.rays import RAY_COLUMNS, Rays
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -118,7 +118,7 @@ def rays_of_body() -> Rays:
     shown, _ = raycast.render(BODY, CAMERA)
     crop = Crop.around(shown, np.isfinite(shown), CAMERA, 0.002)
     assert crop is not None
-    return Rays(crop.observed(0.0, None).object_rays(200), np.empty((0, 8)))
+    return Rays(crop.observed(0.0, None).object_rays(200), np.empty((0, RAY_COLUMNS)))
 
 
 def test_a_body_beside_its_predicted_hull_is_as_much_less_sure(rays_of_body: Rays) -> None:
@@ -196,7 +196,7 @@ def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
     shown, _ = raycast.render(body, CAMERA)
     dents = 0.004 * np.sin(np.linspace(0, 40, shown.shape[1]))[None]
     depth = np.where(mask, shown + dents, 1.5).astype(np.float32)
-    monkeypatch.setattr(surface_fit.exact, "solve", None)
+    monkeypatch.setattr(surface_fit.starts, "everything", None)
     found = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(hull=told(body, 0.004)))
     ahead = np.array([[0.0, 0.0, 1.0]])
     far = found.superquadric.translation[2] + found.superquadric.support(ahead)[0]
@@ -216,8 +216,8 @@ def test_a_thing_cut_short_is_no_surer_than_one_with_time(
         for budget in (math.inf, 1e-9)
     )
     assert "time budget" in hasty.message
-    by_length = [fit.sigma_size[np.argsort(fit.superquadric.size)] for fit in (hasty, patient)]  # z may be another axis
-    assert (by_length[0] > 0.9 * by_length[1]).all()
+    typical = [np.exp(np.log(fit.sigma_size).mean()) for fit in (hasty, patient)]  # z may be another axis
+    assert typical[0] > 0.9 * typical[1]
 
 
 def test_no_form_of_a_hull_is_compiled_for(

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from sq_perception.fitting import outline
+from sq_perception.fitting import course, outline
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.multistart import Problem
 from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.options import FitOptions
-from sq_perception.fitting.problem import Problem
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
@@ -24,7 +24,7 @@ def problem_of(body: Superquadric) -> Problem:
     depth, index = raycast.render(Superquadric.stack([body]), CAMERA)
     crop = Crop.around(np.where(index >= 0, depth, 1.0), index >= 0, CAMERA, 1e-4)
     assert crop is not None
-    return Problem.of(crop.observed(0.0, None), FitOptions(), 0.0)
+    return course.problem_of(crop.observed(0.0, None), FitOptions(), 0.0)
 
 
 @pytest.mark.parametrize(

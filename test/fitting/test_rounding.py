@@ -7,7 +7,7 @@ import pytest
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.rays import DEPTH, RAY_COLUMNS
-from sq_perception.fitting.rounding import faces_camera
+from sq_perception.fitting.valleys import faces_camera
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube

@@ -1,0 +1,234 @@
+"""The course of a fit: the two models of an object, and the body of each.
+
+exact   The object is a superquadric: m = 0, every ray counts as one.
+thing   It strays from one by m, a part of it alike: it counts as few independent rays, and those that a neck or a
+        handle leaves far off hardly count.  Beside a predicted hull its prior is that; else what is known of bodies.
+
+Both are one cost with other terms (docs/surface_fit.md), and one search with other stages.  How much a thing misfits is
+estimated with its body: with c the mean loss of its rays it counts as INDEPENDENT / max(1, c / EXPLAINED) of them,
+since the likelihood maximised over an unknown variance divides by the variance found; and the more it misfits, the more
+it is drawn to a predicted hull (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  That pull does not count
+towards the covariance, and there rays count as fewer by the same factor once more: larger errors extend over larger
+parts, such as a neck, a spout or a dent.
+
+A thing is fitted as its convex hull, which encloses lids below a rim, necks and handles: points behind the surface
+count by Cauchy's loss, and space within the outline's convex hull may be empty.
+
+Metres, radians, optical frame.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sq_perception.fitting import outline
+from sq_perception.fitting.cost import Terms
+from sq_perception.fitting.fit import INLIER
+from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.multistart import (
+    BASIN,
+    COARSE,
+    THING,
+    Problem,
+    Solution,
+    by_cost,
+    within_doubt,
+)
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.options import MODEL_ERROR, TAPER, FitOptions
+from sq_perception.fitting.rays import SAMPLE
+from sq_perception.fitting.residuals import mean_loss, surface_distance
+from sq_perception.geometry.quantiles import deviation
+
+INDEPENDENT, EXPLAINED = 100.0, 0.5
+"""Most rays that a thing counts as, and the mean loss up to which it does: what cartons and cans leave.  Chosen on
+benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the other way."""
+EXPLAINS = 1.4
+"""Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
+not finished.  Chosen on benchmarks/single_body."""
+_PROMISING = 2.0
+"""Mean squared residual after the few steps from a group of starts, above which the next group is tried first.  Of 42
+images that a body explains, none left more than 0.8; of 80 that none explains, nine in ten left more than this."""
+FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
+"""Object rays of the last stage, and most of them under much noise: a depth error of a third of a pixel's width
+averages out to a two hundredth.  Chosen on benchmarks/single_body."""
+_FINE_NOISE = 0.3
+"""Noise, in pixel widths, that the fewest rays of the last stage average out; their number grows with its square."""
+_OUTLIER = 5.0
+"""Distance from the winner's surface, in standard deviations, beyond which object rays are dropped: noise reaches there
+once in two million.  Kept, they look like something left to explain, and other valleys are sought in vain."""
+_HIT_TOLERANCE = 3e-3
+"""Error of g where a ray meets the body.  A search remembers where that was, so that it vanishes as it converges."""
+_PLANE_SIGMA, _GAP_SIGMA, _REST_SIGMA = 0.001, 0.005, 0.05
+"""Standard deviations, metres, of a body's reach below the plane and above it, and of the sine of the angle between the
+normal and an axis of the body: how well a plane fitted to a depth image is known, and a wide prior with long tails
+(:mod:`sq_perception.fitting.priors`).  Both lengths shrink with the model error of small things."""
+_PROPORTION_SIGMA = 1.0
+"""Standard deviation of a log size about the mean of the three: a factor e, a wide prior."""
+_VOLUME_PRICE = 0.5
+"""Price of log(a1 a2 a3) in the cost: what the image does not determine is not to grow.  Chosen on scanned objects."""
+ROUND_SIGMA = 0.06
+"""Scale of log(a1 / a2) and 1 - e2 by which most things are round; see :mod:`sq_perception.fitting.priors`."""
+_HUBER, _INNER_CAUCHY = 1.0, 1.0
+"""Noise levels up to which Huber's loss of a thing's rays is quadratic, and scale of Cauchy's loss behind its surface:
+what strays farther is another part of the thing, a neck or a handle."""
+TAPER_SIGMA = 0.3
+"""Standard deviation of the prior of a taper: of household things bottles have the largest ones, up to 0.6."""
+SPREAD = 2.5**2
+"""Factor of the covariance of what a camera saw where no hull is predicted: errors of residuals are alike."""
+_AS_HULL = ("like the convex hull of the object",)
+
+
+def terms_of(observation: Observation, plane: np.ndarray | None) -> Terms:
+    """The terms of an object that is a superquadric, with those of the plane where one is known."""
+    terms = Terms(
+        hit_tolerance=_HIT_TOLERANCE,
+        pinhole=1.0 if observation.camera.is_pinhole else 0.0,
+        outline_stiffness=1 / observation.outline,
+        proportion_stiffness=1 / _PROPORTION_SIGMA,
+    )
+    if plane is None:
+        return terms
+    scale = min((observation.model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
+    return terms._replace(
+        plane=plane,
+        plane_stiffness=1 / (_PLANE_SIGMA * scale),
+        gap_stiffness=1 / (_GAP_SIGMA * scale),
+        rest_stiffness=1 / _REST_SIGMA,
+        volume_price=_VOLUME_PRICE,
+    )
+
+
+def problem_of(observation: Observation, options: FitOptions, deadline: float) -> Problem:
+    """The problem of an object as a superquadric, or as a thing where its observation knows a model error."""
+    terms = terms_of(observation, options.plane)
+    if not observation.model_error:
+        return Problem.of(observation, options, terms, deadline)
+    terms = terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY)
+    problem = Problem.of(observation.of_hull(), options, terms, deadline)
+    problem = replace(problem, independent=INDEPENDENT)
+    hull = options.predicted_hull()
+    if hull is None:
+        return problem.with_terms(volume_price=_VOLUME_PRICE, roundness_stiffness=1 / ROUND_SIGMA)
+    return replace(problem, hull=hull, terms=_beside(hull, terms)).within(taper=TAPER)
+
+
+def _beside(hull: HullPrior, terms: Terms) -> Terms:
+    return terms._replace(
+        proportion_stiffness=0.0,
+        volume_price=0.0,
+        # Writable and of double precision: kernels would be compiled again for other arrays.
+        hull_directions=np.array(hull.directions, float, order="C"),
+        hull_support=np.array(hull.support, float, order="C"),
+        hull_root=hull.root(),
+        taper_stiffness=1 / TAPER_SIGMA,
+    )
+
+
+def exact(problem: Problem, groups: Iterable[Callable[[], Sequence[State]]], patient: bool = True) -> Solution | None:
+    """The best superquadric from groups of starts, as many as it takes to explain the image.
+
+    None if no group was ``patient`` enough: by default the best of all is followed in the end.
+    """
+    tried: list[State] = []
+    finalists: list[State] = []
+    for group in groups:
+        found = problem.tried(group(), COARSE)
+        tried += found
+        if found and by_cost(found)[0].cost < _PROMISING * problem.floor(COARSE.rays):
+            followed = problem.search(within_doubt(found)[: COARSE.kept], BASIN)
+            finalists = within_doubt([*finalists, *followed])[: COARSE.kept]
+        if (tried and problem.late) or (finalists and finalists[0].cost < EXPLAINS * problem.floor(BASIN[-1].rays)):
+            break
+    if not finalists:
+        if not patient:
+            return None
+        finalists = problem.search(within_doubt(tried)[: COARSE.kept], BASIN)
+    if finalists[0].cost > EXPLAINS * problem.floor(BASIN[-1].rays) and not problem.late:
+        if not patient:
+            return None
+        return Solution(problem, finalists[0], problem.draw(SAMPLE, 0.3))
+    return _on_all_rays(problem, finalists)
+
+
+def _on_all_rays(problem: Problem, finalists: Sequence[State]) -> Solution:
+    """The best of the finalists on all rays, but those that their favourite shows to be none of the object, or of free
+    space; the precision of its outline is read from its misfit."""
+    favourite, *others = finalists
+    if not problem.late:
+        problem, favourite = outline.without_shrunk_edge(problem, favourite)
+    enough = _enough_rays(problem.observation)
+    rays = problem.draw(problem.options.pixels or enough, 0.3)
+    rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
+    few = problem.draw(enough // 4, 0.3)
+    problem, favourite = outline.sharpened(problem, favourite, rays.free, few)
+    settled = by_cost(problem.settle(state, few) for state in [favourite, *others])
+    return Solution(problem, problem.refined_best(settled, rays), rays)
+
+
+def _enough_rays(observation: Observation) -> int:
+    """Number of rays that bring the noise of their mean well below a pixel's width."""
+    ratio = observation.sigma / observation.footprint
+    return int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
+
+
+def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
+    """The rays (k, 7) whose points lie near the surface, measured by the typical distance of all."""
+    distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
+    spread = max(observation.sigma, deviation(distance))
+    return hits[distance < _OUTLIER * spread]
+
+
+def thing(problem: Problem, starts: Sequence[State]) -> Solution:
+    """The most probable body of a thing, its misfit estimated with it."""
+    straight = problem.within(taper=0.0)
+    settled = straight.search(starts, THING)
+    misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
+    drawn = problem
+    if misfit > 1.0 and problem.hull is not None:
+        terms = problem.terms._replace(hull_root=problem.hull.root(misfit))
+        drawn = replace(problem, independent=INDEPENDENT / misfit, terms=terms)
+    if not problem.late:
+        settled = drawn.search(settled, THING[1:])
+    rays = drawn.draw(problem.options.pixels or SAMPLE, 0.3)
+    spread = SPREAD if problem.hull is None else 1.0
+    solution = Solution(drawn, drawn.refined_best(settled, rays), rays, spread_factor=spread)
+    solution = solution if problem.hull is None else _straight_unless_known(solution)
+    problem = replace(problem, limits=solution.problem.limits)
+    problem = problem.with_terms(taper_stiffness=solution.problem.terms.taper_stiffness)
+    left = _mean_loss(problem, solution.state)
+    solution = replace(solution, problem=problem, rays=rays.weighing(1 / max(1.0, left / EXPLAINED)))
+    if left > _typical_of_hollow(problem):
+        solution = replace(solution, notes=_AS_HULL, as_hull=True)
+    return solution
+
+
+def _straight_unless_known(solution: Solution) -> Solution:
+    """The solution, its body fitted once more without a taper where the evidence is not for one.
+
+    The ratio of the evidence for k = 0 to that for any k is that of the densities of the posterior and the prior there
+    (J. M. Dickey, The weighted likelihood ratio, Annals of Mathematical Statistics 42(1), 1971): no price of parameters
+    is to be chosen.
+    """
+    problem, taper, covariance = solution.problem, solution.state.parameters[8:], solution.taper_covariance
+    known = taper @ np.linalg.solve(covariance, taper) + np.linalg.slogdet(covariance)[1]
+    if known > 4 * math.log(TAPER_SIGMA) or problem.late:
+        return solution
+    straight = problem.with_terms(taper_stiffness=0.0).within(taper=0.0)
+    return replace(solution, problem=straight, state=straight.refine(solution.state, solution.rays))
+
+
+def _mean_loss(problem: Problem, body: State) -> float:
+    """Mean loss of the object's rays: c of the module."""
+    rays = problem.observation.object_rays(SAMPLE, 0.1)
+    return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
+
+
+def _typical_of_hollow(problem: Problem) -> float:
+    """Huber's loss of a point as far off as noise reaches at most: a bowl's or a pair of pliers' typically have it."""
+    return problem.terms.huber * (2 * INLIER - problem.terms.huber)

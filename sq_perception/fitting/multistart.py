@@ -1,0 +1,265 @@
+"""One object to fit as data, and the search from many starts that every fit is.
+
+The cost of a body is minus twice the logarithm of its posterior, docs/surface_fit.md:
+
+    cost = sum_i w_i rho(r_i) + priors,     r_i = (rendered - measured depth) / sqrt(s^2 + m^2)
+
+over the object's rays and those of free space (:mod:`sq_perception.fitting.residuals`), with the noise s, the model
+error m, and the priors of :mod:`sq_perception.fitting.priors`.  A body that leaves nothing but noise costs about the
+total weight of the object's rays.
+
+A search goes through stages (:class:`Stage`): from each body at hand so many steps with a residual on so many rays;
+the best ones that the noise does not tell apart go on.
+
+Metres, optical frame.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sq_perception.fitting.cost import Terms
+from sq_perception.fitting.covariance import UNTAPERED, Alternative, covariance_at
+from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.options import FitOptions, limits
+from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
+from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
+from sq_perception.geometry.superquadric import Superquadric
+
+
+class Stage(NamedTuple):
+    """A stage of a search: the residual, object rays, steps from each body, bodies that go on, and the place between
+    two pixels, 0 to 1, where the draw of rays begins: others take other pixels."""
+
+    residual: int
+    rays: int
+    steps: int
+    kept: int
+    offset: float
+
+
+# Chosen on benchmarks/single_body and benchmarks/household_things.
+COARSE = Stage(SAMPSON, 150, 8, 3, 0.5)
+BASIN = (Stage(SAMPSON, 300, 15, 3, 0.7), Stage(RENDERED, 300, 15, 3, 0.7))
+THING = (Stage(RENDERED, 150, 8, 4, 0.7), Stage(RENDERED, 150, 15, 3, 0.7))
+SETTLE = Stage(RENDERED, 300, 15, 3, 0.2)
+
+STEPS = 30
+"""Most steps of the last search, on all rays: beyond need."""
+FREE_SHARE = 0.25
+"""Free rays per object ray: an outline has fewer pixels than an area."""
+TOLERANCE, FINAL_TOLERANCE = 1e-3, 3e-5
+"""Gain, as a share of the cost, that a step must promise: a stage ends before one that promises less."""
+DOUBT, RIVAL = 25.0, 1.3
+"""Excess of a cost over the best, and factor of it, up to either of which bodies go on together: on the same rays,
+noise gives a difference D a standard deviation of 2 sqrt(D), of which the first is 2.5; few steps have not converged.
+"""
+SLACK = 4.0
+"""Difference of costs that few rays may hide: one such standard deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One object to fit.
+
+    Attributes
+    ----------
+    observation
+        What the image shows of the object.
+    options
+        What the caller wants.
+    terms
+        Constants of the residuals and priors.
+    limits
+        Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y.
+    deadline
+        ``time.perf_counter`` after which nothing new is tried.
+    independent
+        Number of independent rays that the object counts as, however many are drawn, where errors of neighbouring
+        pixels are alike; None where every ray counts as one.
+    expected
+        A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
+    hull
+        A prediction of the thing's hull, which weighs in through the terms.
+    """
+
+    observation: Observation
+    options: FitOptions
+    terms: Terms
+    limits: tuple[np.ndarray, np.ndarray]
+    deadline: float
+    independent: float | None = None
+    expected: Superquadric | None = None
+    hull: HullPrior | None = None
+
+    @classmethod
+    def of(cls, observation: Observation, options: FitOptions, terms: Terms, deadline: float) -> Problem:
+        """The problem of a superquadric that leaves nothing but noise."""
+        return cls(observation, options, terms, limits(observation.points), deadline)
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return time.perf_counter() > self.deadline
+
+    def terms_at(self, state: State) -> Terms:
+        """The terms with the predicted half sizes along the axes that a body has now."""
+        if self.expected is None:
+            return self.terms
+        return self.terms._replace(expected=self.expected.support(state.rotation.T))
+
+    def with_terms(self, **changed: Any) -> Problem:
+        """The problem with some terms changed."""
+        return replace(self, terms=self.terms._replace(**changed))
+
+    def within(self, taper: float) -> Problem:
+        """The problem with tapers up to a limit."""
+        lower, upper = (limit.copy() for limit in self.limits)
+        lower[8:], upper[8:] = -taper, taper
+        return replace(self, limits=(lower, upper))
+
+    def without_hull(self) -> Problem:
+        """The problem as if no hull had been predicted."""
+        return replace(self, terms=self.terms._replace(hull_directions=self.terms.hull_directions[:0]), hull=None)
+
+    def floor(self, count: int) -> float:
+        """Cost of a body that leaves nothing but noise on ``count`` drawn rays: their total weight."""
+        return float(min(count, len(self.observation.pixels))) if self.independent is None else self.independent
+
+    def draw(self, count: int, offset: float) -> Rays:
+        """About ``count`` object rays, and the free rays that come with them."""
+        seen = self.observation
+        hits, free = seen.object_rays(count, offset), seen.free_rays(int(FREE_SHARE * count), offset)
+        if self.independent is not None:
+            hits[:, WEIGHT] = self.independent / len(hits)
+            if len(free):
+                free[:, WEIGHT] = self.independent / len(seen.pixels) * seen.free_pixels / len(free)
+        return Rays(hits, free)
+
+    def search(self, starts: Iterable[State], stages: Sequence[Stage]) -> list[State]:
+        """The bodies, best first, that go on from the last of some stages; from the first start at least."""
+        states = list(starts)
+        for stage in stages:
+            found = self.tried(states, stage)
+            states = (within_doubt(found) if self.independent is None else by_cost(found))[: stage.kept]
+        return states
+
+    def tried(self, states: Iterable[State], stage: Stage) -> list[State]:
+        """Where a stage leads from each body, in their order, while there is time; from the first one at least."""
+        rays = self.draw(stage.rays, stage.offset)
+        found: list[State] = []
+        for state in states:
+            found.append(self._minimized(stage.residual, state, rays, stage.steps, TOLERANCE))
+            if self.late:
+                break
+        return found
+
+    def settle(self, state: State, rays: Rays, steps: int = SETTLE.steps) -> State:
+        """A body after some steps with the rendered residual on rays at hand."""
+        return self._minimized(RENDERED, state, rays, steps, TOLERANCE)
+
+    def held(self, state: State, axis: int, rays: Rays) -> State:
+        """A body after some steps with the rendered residual, its half size along an axis kept, within its limits."""
+        lower, upper = (limit.copy() for limit in self.limits)
+        lower[axis] = upper[axis] = min(max(state.parameters[axis], lower[axis]), upper[axis])
+        return minimize(RENDERED, *rays, self.terms_at(state), state, (lower, upper), SETTLE.steps, TOLERANCE)
+
+    def refine(self, state: State, rays: Rays, steps: int = STEPS) -> State:
+        """A body at the end of its valley."""
+        return self._minimized(RENDERED, state, rays, steps, FINAL_TOLERANCE)
+
+    def refined_best(self, settled: Sequence[State], rays: Rays) -> State:
+        """The best body on these rays of the first ones of some, best first, that few rays do not tell apart."""
+        found = [self.refine(settled[0], rays)]
+        for state in settled[1:]:
+            if self.late or state.cost > settled[0].cost + SLACK:
+                break
+            found.append(self.refine(state, rays))
+        return by_cost(found)[0]
+
+    def _minimized(self, residual: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
+        return minimize(residual, *rays, self.terms_at(state), state, self.limits, steps, tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A body on its way through the last steps of a fit; what :mod:`sq_perception.fitting.quality` reads in the end.
+
+    Attributes
+    ----------
+    problem
+        The problem of the last stage, with its observation, terms and prior.
+    state, rays
+        The body, and the rays on which its cost is measured.
+    alternatives
+        Other bodies that explain the image almost as well.
+    notes
+        What the body rests on beyond the image, for the message.
+    spread_factor
+        Factor of the covariance, where residuals err alike.
+    as_hull
+        Whether the body resembles the convex hull of the object only.
+    is_unfinished
+        Whether time was up before the search came near the noise, so that the body may be off by any distance.
+    """
+
+    problem: Problem
+    state: State
+    rays: Rays
+    alternatives: tuple[Alternative, ...] = ()
+    notes: tuple[str, ...] = ()
+    spread_factor: float = 1.0
+    as_hull: bool = False
+    is_unfinished: bool = False
+
+    @property
+    def misfit(self) -> float:
+        """Mean squared residual, in units of the noise and the model error."""
+        return self.state.cost / self.rays.weight
+
+    @cached_property
+    def distances(self) -> np.ndarray:
+        """Sampson distances (n,) of a sample of the object's points to the body, metres, positive outside."""
+        rays = self.problem.observation.object_rays(SAMPLE)
+        return surface_distance(rays, self.state.parameters, self.state.rotation)
+
+    @cached_property
+    def covariance(self) -> np.ndarray:
+        """Covariance (11, 11) from the valley of the cost around the body and its distance to a predicted hull."""
+        return np.ascontiguousarray(self._with_taper[:UNTAPERED, :UNTAPERED])
+
+    @property
+    def taper_covariance(self) -> np.ndarray:
+        """Covariance (2, 2) of the tapers; 0 where the body may not taper."""
+        found = self._with_taper[UNTAPERED:, UNTAPERED:]
+        return np.ascontiguousarray(found) if len(found) else np.zeros((2, 2))
+
+    @cached_property
+    def _with_taper(self) -> np.ndarray:
+        terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
+        return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
+
+    def unsure(self) -> np.ndarray:
+        """Standard deviations (3,) of the half sizes, as shares of them."""
+        deviations = np.sqrt(np.diag(self.covariance)[:3])
+        return np.asarray(deviations / self.state.parameters[:3])
+
+
+def within_doubt(candidates: Iterable[State]) -> list[State]:
+    """Candidates, best first, without those that are worse than the best by more than noise can make them."""
+    ranked = by_cost(candidates)
+    least = ranked[0].cost
+    return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
+
+
+def by_cost(states: Iterable[State]) -> list[State]:
+    """The bodies, cheapest first."""
+    return sorted(states, key=lambda state: state.cost)

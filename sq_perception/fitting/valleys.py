@@ -1,0 +1,369 @@
+"""Other bodies that the image allows: what the valley of the cost around the result does not tell.
+
+Other valleys.  Seen from one side, a body's own axes and the face it shows are mostly certain, while the order of its
+axes and the half size that runs away from the camera are not: the cost has a valley for each.
+
+Open half sizes.  The curvature of the cost tells how sure a size is where the valley is a parabola.  It is none
+
+- of a face that looks at the camera, read in whole steps q of depth with little noise: all readings of the face err
+  alike, by up to q / 2, and least squares takes that error for information on the outline.  The true body certainly
+  passes every reading at no more than q / 2: residuals count beyond that only (a dead zone; M. Milanese, A. Vicino,
+  Optimal estimation theory for dynamic systems with set membership uncertainty, Automatica 27(6), 1991);
+- where the border of the image, or of its readings, cuts an object: the cost has a wall where the body would be too
+  short to reach the border and is flat beyond.  A predicted hull does not count there: it mostly ends at the border
+  too;
+- where what the image shows leaves a size open, and priors decide.
+
+Of the first two, bodies are held at one half size after another and the rest is fitted; what the image allows adds to
+the covariance.  Of the last, bodies compete of which the size is like the other two, thin, or as predicted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from sq_perception.fitting import starts
+from sq_perception.fitting.covariance import Alternative, undetermined
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.multistart import SETTLE, SLACK, Problem, Solution, by_cost
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.rays import DEPTH, Rays
+from sq_perception.fitting.starts import resized
+from sq_perception.geometry.kernels import kernel
+
+SIGNIFICANT = 0.5
+"""A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
+_ALIKE = 0.01
+"""Half sizes that differ by less than this share are the same."""
+_SETTLED, _UNSURE = 1.03, 0.01
+"""Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
+valleys of the cost are tried; chosen on benchmarks/single_body."""
+_FIRST_STEPS, _HOPELESS = 5, 2.0
+"""First steps of a rival, and its cost then, as a multiple of the body's at hand, from which on it is given up."""
+_FACE_SHARE = 0.04
+"""Share of all rays that have a depth in common, from which on it is that of a face."""
+_DEAD_ZONE = 0.5 * 1.01
+"""Residual, in steps, up to which it counts as 0: half a step, and a little for single precision."""
+_CONTRADICTED = 0.003
+"""Mean squared residual beyond half a step, in units of the noise, above which a body is wrong.  Of 1000 of the thesis'
+images all but one leave 0.0007 at most; a body 3 % too long left 0.01, its mean squared residual was 0.85, the right
+one's 0.76."""
+_RAYS = 1000
+"""Rays of the search for each body of a walk, which begins at a neighbour's."""
+_PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
+"""Factors from one half size to the next, up and down from the one at hand."""
+_UNLIKELY = 12.0
+"""Excess of the cost over the least, twice in a row, at which a walk ends."""
+_CERTAIN, _OPEN = 0.02, 0.1
+"""Standard deviation of the log size below which nothing is open, and from which on the mean of all bodies replaces the
+best."""
+_FACE_SPREAD = 1.5
+"""Factor of the other standard deviations: all readings of a face err alike."""
+_ALLOWED = 3.0
+"""Cost up to which the readings allow a body, without which no walk ends early: the true one costs nothing."""
+_LONGER = (1.25, 1.6)
+"""Factors of a half size whose end is beyond the border."""
+_NO_EVIDENCE = 12.5
+"""Excess of a cost that is no evidence against a length: through noise its standard deviation is 7."""
+_OVAL = 0.25
+"""Share of things that are not round among those of which the image does not tell."""
+_EXPECTATION_SIGMA = 0.25
+"""Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
+
+
+def alike(state: State, other: State) -> bool:
+    """Whether two searches ended in the same valley: at about the same cost and sizes, in any of a body's forms."""
+    if abs(state.cost - other.cost) > SIGNIFICANT:
+        return False
+    sizes = np.abs(np.sort(state.parameters[:3]) - np.sort(other.parameters[:3]))
+    return bool((sizes < _ALIKE * np.sort(state.parameters[:3])).all())
+
+
+def explored(solution: Solution) -> Solution:
+    """The solution of an exact superquadric after a search of other valleys, of which noise and a poor view may hide a
+    deeper one.
+
+    Rivals are the same body with a half size that the image hardly determines made smaller or larger, the seen face in
+    place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.  They
+    are fitted with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
+    """
+    found: list[State] = []
+    while True:
+        best = solution.state
+        unexplained = solution.misfit > _SETTLED or _contradicts(solution)
+        unsure = solution.unsure()
+        if solution.problem.late or not (unexplained or unsure.max() > _UNSURE):
+            break
+        rivals = starts.other_depths(best, int(np.argmax(unsure)))
+        if unexplained:
+            rivals += starts.other_axes(best)
+        refined = _refined(solution, rivals)
+        found += refined
+        better = by_cost(refined)[0] if refined else best
+        if better.cost >= best.cost - SIGNIFICANT:
+            break
+        found.append(best)
+        solution = replace(solution, state=better)
+    others = [state for state in found if not alike(state, best)]
+    weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
+    more = (Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))
+    return replace(solution, alternatives=(*solution.alternatives, *more))
+
+
+def _refined(solution: Solution, rivals: list[State]) -> list[State]:
+    """Rivals on all rays: those that hold on few, one a valley, and not in that of the body at hand."""
+    problem, best = solution.problem, solution.state
+    few = problem.draw(SETTLE.rays, SETTLE.offset)
+    reference = problem.settle(best, few)
+    hopeless, chosen = _HOPELESS * reference.cost, [best._replace(cost=reference.cost)]
+    # On other rays the body may already find its way out of a shallow valley.
+    settled = [reference]
+    for rival in rivals:
+        state = problem.settle(rival, few, _FIRST_STEPS)
+        if state.cost < hopeless:
+            settled.append(problem.settle(state, few, SETTLE.steps - _FIRST_STEPS))
+        if problem.late:
+            break
+    for state in by_cost(settled):
+        if state.cost < reference.cost + SLACK and not any(alike(state, other) for other in chosen):
+            chosen.append(state)
+    return [problem.refine(state, solution.rays) for state in chosen[1 : 1 + SETTLE.kept]]
+
+
+# Open half sizes
+
+
+def along_view(solution: Solution) -> Solution:
+    """The solution with all half sizes along the view that the image allows, where readings are rounded."""
+    quantum = solution.problem.observation.noise.quantum
+    if quantum > 0 and faces_camera(solution.rays.hits, quantum):
+        best, allowed = plausible(solution)
+        solution = replace(solution, state=best)
+        if allowed:
+            solution = replace(solution, alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
+    return solution
+
+
+def weighed(solution: Solution) -> Solution:
+    """The solution, or a better one once half sizes that the image leaves open are left to priors and a prediction."""
+    problem, state, rays = solution.problem, solution.state, solution.rays
+    expected = problem.options.expected
+    weak = np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))
+    if len(weak) == 0 or problem.hull is not None or problem.late:
+        return solution
+    rivals = [state]
+    for k in weak:
+        typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
+        rivals += [resized(state, int(k), size) for size in (typical, 0.3 * typical)]
+    if expected is not None:
+        prior = expected() if callable(expected) else expected
+        problem = replace(problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA), expected=prior)
+        solution = replace(solution, notes=(*solution.notes, "half sizes weighed against a prediction"))
+        extents = prior.support(state.rotation.T)
+        rivals += [resized(state, int(k), float(extents[k])) for k in weak]
+    few = problem.draw(SETTLE.rays, SETTLE.offset)
+    few = few.weighing(rays.weight / few.weight)
+    settled = by_cost(problem.settle(rival, few) for rival in rivals)
+    return replace(solution, problem=problem, state=problem.refined_best(settled, rays))
+
+
+def or_oval(solution: Solution) -> Solution:
+    """The solution of a thing, with the body that the image prefers without regard to roundness as another one."""
+    problem, rays = solution.problem, solution.rays
+    free = problem.with_terms(roundness_stiffness=0.0)
+    oval = replace(solution, problem=free, state=free.refine(solution.state, rays))
+    dearer = problem.settle(oval.state, rays, 0).cost - problem.settle(solution.state, rays, 0).cost
+    share = _OVAL / (_OVAL + (1 - _OVAL) * math.exp(0.5 * max(dearer, 0.0)))
+    return replace(solution, alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
+
+
+def _contradicts(solution: Solution) -> bool:
+    """Whether the body passes rounded readings at more than half a step, as the true one does not.
+
+    The sum of squares hardly shows it: below half a step a residual is the rounding's, and says nothing.
+    """
+    if solution.problem.observation.noise.quantum == 0.0:
+        return False
+    left = _rounded(solution.problem).refine(solution.state, solution.rays, steps=0)
+    return left.cost > _CONTRADICTED * solution.rays.weight
+
+
+def _rounded(problem: Problem) -> Problem:
+    """The problem with residuals that count only beyond half a step."""
+    observation = problem.observation
+    return problem.with_terms(dead_zone=_DEAD_ZONE * observation.noise.quantum / observation.sigma)
+
+
+def faces_camera(hits: np.ndarray, quantum: float) -> bool:
+    """Whether many rays (n, 7) read the same depth."""
+    depth = hits[:, DEPTH]
+    level = np.rint((depth - depth.min()) / quantum).astype(np.int64)
+    return bool(np.bincount(level).max() > _FACE_SHARE * len(hits))
+
+
+def _view_axis(state: State) -> int:
+    """The axis of the body that is nearest to the camera's."""
+    return int(np.argmax(np.abs(state.rotation[2])))
+
+
+def plausible(solution: Solution) -> tuple[State, list[Alternative]]:
+    """The best body, and those that the rounded readings allow, none if no other than the given one.
+
+    The best is the given one, which averages roundings out, as long as the readings hardly leave a size open, else the
+    mean of all.
+    """
+    best, rays = solution.state, solution.rays
+    rays = rays.every(max(1, len(rays.hits) // _RAYS))
+    walk = _Walk(_rounded(solution.problem), rays)
+    walk.along_view(best)
+    if walk.least < _ALLOWED and walk.deviation() < _CERTAIN:
+        return best, []
+    start = walk.states[walk.sizes.index(math.log(best.parameters[_view_axis(best)]))]
+    for rival in starts.other_orders(best):
+        walk.along_view(rival)
+    if walk.deviation() < _OPEN and start.cost < walk.least + _ALLOWED:
+        return best, walk.alternatives()
+    return walk.mean(), walk.alternatives()
+
+
+class _Walk:
+    """Bodies held at one half size along the view after another, from starts outwards, and their weights."""
+
+    def __init__(self, problem: Problem, rays: Rays) -> None:
+        self.problem, self.rays = problem, rays
+        self.states: list[State] = []
+        self.sizes: list[float] = []
+        self.paces: list[float] = []
+        self.least = math.inf
+
+    def along_view(self, start: State) -> None:
+        """Walk from one start, up and down, until the readings forbid to go on."""
+        axis = _view_axis(start)
+        log_size = math.log(start.parameters[axis])
+        here = self._held(start, log_size)
+        found = {log_size: here}
+        self.least = min(self.least, here.cost)
+        for direction in (1, -1):
+            state, position, unlikely = here, log_size, 0
+            for pace in _PACES:
+                position += direction * math.log(pace)
+                state = found[position] = self._held(state, position)
+                self.least = min(self.least, state.cost)
+                unlikely = unlikely + 1 if state.cost > self.least + _UNLIKELY else 0
+                if unlikely == 2 and self.least < _ALLOWED:
+                    break
+        sizes = sorted(found)
+        self.sizes += sizes
+        self.states += [found[x] for x in sizes]
+        self.paces += np.gradient(sizes).tolist()
+
+    def weights(self) -> np.ndarray:
+        """Weights (n,) of the bodies for a uniform density of the log size; they sum to 1."""
+        cost = np.array([state.cost for state in self.states])
+        weights = np.exp(-0.5 * (cost - self.least)) * np.array(self.paces)
+        return np.asarray(weights / weights.sum())
+
+    def deviation(self) -> float:
+        """Standard deviation of the log size."""
+        weights, sizes = self.weights(), np.array(self.sizes)
+        return math.sqrt(weights @ (sizes - weights @ sizes) ** 2)
+
+    def mean(self) -> State:
+        """The body of the mean log size, fitted from the likeliest one near it."""
+        weights, sizes = self.weights(), np.array(self.sizes)
+        mean = float(weights @ sizes)
+        near = np.argsort(np.abs(sizes - mean))[:3]
+        nearest = min((self.states[k] for k in near), key=lambda state: state.cost)
+        return self._held(nearest, mean)
+
+    def alternatives(self) -> list[Alternative]:
+        return [Alternative(state, float(w)) for state, w in zip(self.states, self.weights(), strict=True)]
+
+    def _held(self, start: State, log_size: float) -> State:
+        axis = _view_axis(start)
+        lower, upper = self.problem.limits
+        size = min(max(math.exp(log_size), lower[axis]), upper[axis])
+        return self.problem.held(resized(start, axis, size), axis, self.rays)
+
+
+def with_open_ends(solution: Solution) -> Solution:
+    """The solution, with longer bodies as alternatives where the image's border hides how long it is."""
+    problem, state = solution.problem, solution.state
+    ends = list(_hidden_ends(problem.observation, state))
+    if not ends:
+        return solution
+    problem = problem.without_hull()
+    rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
+    most = problem.settle(state, rays, 0).cost + _NO_EVIDENCE
+    found = []
+    for axis, sign in ends:
+        for factor in _LONGER:
+            longer = min(factor * state.parameters[axis], problem.limits[1][axis])
+            other = problem.held(_longer(state, axis, sign, longer), axis, rays)
+            if other.cost < most:
+                found.append(other)
+        if problem.late:
+            break
+    others = tuple(Alternative(other, 1 / (1 + len(found))) for other in found)
+    return replace(solution, alternatives=(*solution.alternatives, *others))
+
+
+def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:
+    """Axis and sign of each end of a body beyond all readings, on a side where readings end within the object.
+
+    They end at the image's border, or at a band without readings along it: of a rectified image, of a stereo camera.
+    """
+    left, top, right, bottom, cut = _borders(observation.depth, observation.mask, observation.free)
+    if not cut.any():
+        return
+    camera = observation.camera
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            u, v = camera.project(state.parameters[5:8] + sign * state.parameters[axis] * state.rotation[:, axis])
+            if not np.isfinite([u, v]).all():
+                continue
+            row, column = (int(np.clip(np.rint(at), 0, n - 1)) for at, n in ((v, camera.height), (u, camera.width)))
+            if (cut & [u < left[row], v < top[column], u > right[row], v > bottom[column]]).any():
+                yield axis, sign
+
+
+@kernel
+def _borders(
+    depth: np.ndarray, mask: np.ndarray, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """First reading of each row (h,) and column (w,), the last ones, and on which of these sides (4,) the object has
+    any of them.  Free pixels, indices into the image (h, w), count as readings: some are known to be empty without one.
+    """
+    height, width = depth.shape
+    known = np.isfinite(depth)
+    for pixel in free:
+        known[pixel // width, pixel % width] = True
+    left, right = np.full(height, width), np.full(height, -1)
+    top, bottom = np.full(width, height), np.full(width, -1)
+    for v in range(height):
+        for u in range(width):
+            if known[v, u]:
+                left[v], right[v] = min(left[v], u), u
+                top[u], bottom[u] = min(top[u], v), v
+    cut = np.zeros(4, np.bool_)
+    for v in range(height):
+        if right[v] >= 0:
+            cut[0] |= mask[v, left[v]]
+            cut[2] |= mask[v, right[v]]
+    for u in range(width):
+        if bottom[u] >= 0:
+            cut[1] |= mask[top[u], u]
+            cut[3] |= mask[bottom[u], u]
+    return left, top, right, bottom, cut
+
+
+def _longer(state: State, axis: int, sign: float, size: float) -> State:
+    """The body with one end farther out and the other one in place."""
+    parameters = state.parameters.copy()
+    parameters[5:8] += sign * (size - parameters[axis]) * state.rotation[:, axis]
+    parameters[axis] = size
+    return state._replace(parameters=parameters)
