@@ -51,8 +51,10 @@ Array = Any
 
 FLAT_LENGTH, NUMBERS = 12, 14
 """Numbers of a body without and with its taper."""
-_SCAN, _HALVINGS = 7, 50
-"""Points of a tapered body's profile from which its support is sought, and steps of the search."""
+_SCAN, _SECTIONS, _GOLDEN = 25, 45, 0.618033988749895
+"""Points of a tapered body's profile from which its support is sought, golden sections of that, and their ratio."""
+_LEAST_COSINE = 1e-12
+"""Least sine and cosine of a point on a profile: the derivatives of their powers stay finite."""
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
 _ENDS = np.array([1.0, -1.0, -1.0, 1.0])
@@ -436,8 +438,8 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
     """Support (..., N) of tapered bodies: the largest one of their sections.
 
     The section at z = t a3 has n_z a3 t + sigma S(t): (t, sigma) runs on the profile, a unit ball, and S is the dual
-    norm of (a1 f1 n_x, a2 f2 n_y).  At the maximum the normal of the profile is along (A, S), A = n_z a3 + sigma S'.
-    The best of some points of the profile is followed to there by halving, by the sine s of its normal.
+    norm of (a1 f1 n_x, a2 f2 n_y).  Along the profile, t = +-sin^e1(w) and sigma = cos^e1(w), octahedra have several
+    maxima: the best of some points is followed by golden sections.
 
     Parameters
     ----------
@@ -450,29 +452,25 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
     taper : (..., 1, 2)
     """
     xp = array_namespace(q)
-    e1, e2 = conjugate[..., 0], conjugate[..., 1]
-    q, taper = q + 0 * taper[..., :1], taper + 0 * q[..., :2]
+    e1, e2 = 2 - conjugate[..., 0], conjugate[..., 1]
 
-    def at(s: Array) -> tuple[Array, Array]:
-        """The support by one point, and by how much its normal is above that of the maximum."""
-        cosine = xp.sqrt(xp.clip(1 - s * s, min=0.0))
-        _, sigma, high = _p_norm_and_slopes(cosine, xp.abs(s), e1)
-        t = high * xp.sign(s)
+    def at(w: Array) -> Array:
+        """The support by one point of the profile."""
+        sine, cosine = xp.abs(xp.sin(w)), xp.clip(xp.cos(w), min=_LEAST_COSINE)
+        t = xp.sign(w) * xp.clip(sine, min=_LEAST_COSINE) ** e1 * (sine > 0)
         u, v = q[..., 0] * (1 + taper[..., 0] * t), q[..., 1] * (1 + taper[..., 1] * t)
-        across, by_u, by_v = _p_norm_and_slopes(u, v, e2)
-        tilted = along + sigma * (by_u * q[..., 0] * taper[..., 0] + by_v * q[..., 1] * taper[..., 1])
-        return along * t + sigma * across, s * across - cosine * tilted
+        return along * t + cosine**e1 * p_norm(u, v, e2)
 
-    sines = xp.sin(math.pi * (xp.arange(_SCAN) / (_SCAN - 1) - 0.5))
-    shape = along + 0 * q[..., 0]
-    values = xp.stack([at(s + 0 * shape)[0] for s in sines], axis=-1)
-    best = xp.argmax(values, axis=-1)
-    low, high = sines[xp.clip(best - 1, min=0)], sines[xp.clip(best + 1, max=_SCAN - 1)]
-    for _ in range(_HALVINGS):
-        middle = (low + high) / 2
-        _, above = at(middle)
-        low, high = xp.where(above > 0, low, middle), xp.where(above > 0, middle, high)
-    return at((low + high) / 2)[0]
+    step = math.pi / (_SCAN - 1)
+    still = 0 * (along + q[..., 0] + taper[..., 0])
+    values = xp.stack([at(k * step - math.pi / 2 + still) for k in range(_SCAN)], axis=-1)
+    low = (xp.argmax(values, axis=-1) - 1) * step - math.pi / 2 + still
+    high = low + 2 * step
+    for _ in range(_SECTIONS):
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        falls = at(left) > at(right)
+        low, high = xp.where(falls, low, left), xp.where(falls, right, high)
+    return xp.maximum(at((low + high) / 2), xp.max(values, axis=-1))
 
 
 def nested_norm(x: Array, y: Array, z: Array, e1: Array, e2: Array) -> Array:

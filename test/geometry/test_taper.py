@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numba import njit
 from scipy.spatial import cKDTree
 
 from sq_perception.geometry import kernels
@@ -104,6 +105,54 @@ def test_rays_meet_the_body_where_they_meet_a_dense_mesh() -> None:
         surface = mesh(body, 96)
         distance, _ = cKDTree(surface.sample(100000, seed=0)).query(points[::10])
         assert distance.max() < 0.03 * body.size.max()
+
+
+@njit
+def first_hits(points: np.ndarray, form: tuple[float, ...]) -> np.ndarray:
+    """Where rays from a camera far down x meet the body that they lead to points (n, 3) of, as shares of the way."""
+    shares = np.empty(len(points))
+    origin = np.array([-2.0, 0.1, 0.2])
+    for i in range(len(points)):
+        x, y, z = points[i] - origin
+        hit, share = kernels.ray_entry((origin[0], origin[1], origin[2]), (x, y, z), form)
+        shares[i] = share if hit else np.inf
+    return shares
+
+
+def test_a_million_rays_to_a_dense_surface_meet_it_there_or_before() -> None:
+    """No ray passes through a body unseen, and what it meets is the surface."""
+    rng = np.random.default_rng(8)
+    for _ in range(8):
+        body = tapered(rng, largest=0.9)
+        body = Superquadric.at_origin(body.size, body.shape, body.taper)
+        angles = rng.uniform([-np.pi / 2, -np.pi], [np.pi / 2, np.pi], (125_000, 2))
+        points = np.asarray(body.parametric_points(angles[:, 0], angles[:, 1])).reshape(-1, 3)
+        shares = first_hits(points, form_of(body))
+        # An edge that a ray grazes by less than the sampling's error may be missed.
+        assert np.mean(~(shares < 1 + 1e-6)) < 1e-4
+        origin = np.array([-2.0, 0.1, 0.2])
+        hit = np.isfinite(shares)
+        met = origin + shares[hit, None] * (points[hit] - origin)
+        np.testing.assert_allclose(body.gauge(met), 1.0, atol=1e-6)
+
+
+def test_the_support_is_the_largest_of_all_sections() -> None:
+    """Octahedra with unequal tapers too, whose sections have several maxima."""
+    rng = np.random.default_rng(1)
+    t = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 20001))
+    for _ in range(100):
+        shape, size, taper = rng.uniform(0.03, 2, 2), rng.uniform(0.02, 0.1, 3), rng.uniform(-0.9, 0.9, 2)
+        body = Superquadric(size, shape, np.zeros(3), [0.0, 0.0, 0.0, 1.0], taper)
+        ways = rng.normal(size=(20, 3))
+        across = np.abs(ways[:, :2, None]) * size[:2, None] * (1 + taper[:, None] * t)
+        dual = 2 / max(2 - shape[1], 1e-3)
+        largest = across.max(axis=1)
+        sections = largest * ((across / largest[:, None]) ** dual).sum(axis=1) ** (1 / dual)
+        reach = ways[:, 2:] * size[2] * t + (1 - np.abs(t) ** (2 / shape[0])) ** (shape[0] / 2) * sections
+        np.testing.assert_allclose(body.support(ways), reach.max(axis=1), rtol=1e-5)
+        if (shape <= 1).all():
+            compiled = [kernels.support(*way, *size, *shape, *taper) for way in ways]
+            np.testing.assert_allclose(compiled, reach.max(axis=1), rtol=1e-5)
 
 
 def test_all_forms_are_the_same_body() -> None:
