@@ -12,7 +12,7 @@ equally probable, as far as the image does not tell:
 
 - An object that stands on a plane, or whose hull is predicted, is fitted as a thing.  If that leaves less than the
   noise, or the noise is too fine to hide anything, a superquadric is sought from there.  One that leaves no more than
-  the noise is the result, the thing's body another one that the image allows.
+  the noise and no half size open is the result, the thing's body another one that the image allows.
 - Any other is fitted as a superquadric, and as a thing where that leaves more than the noise; the thing strays by what
   it left.
 
@@ -33,7 +33,7 @@ from typing import Literal
 import numpy as np
 
 from sq_perception.fitting import course, starts, valleys
-from sq_perception.fitting.covariance import Alternative
+from sq_perception.fitting.covariance import WEAK_SHARE, Alternative
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
@@ -155,7 +155,7 @@ class _Task:
         """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
         if self.options.plane is not None:
             return True
-        return not self.fills_image and self.options.predicted_hull() is not None
+        return self.camera.is_pinhole and not self.fills_image and self.options.predicted_hull() is not None
 
     @cached_property
     def model_error(self) -> float:
@@ -191,7 +191,7 @@ def _solved(task: _Task) -> Solution | None:
         if thing is None or thing.problem.late or not (task.is_fine or _is_explained(thing, task.crop.noise.sigma)):
             return thing
         exactly = _exactly(task, [thing.state], patient=False)
-        if exactly is None or exactly.misfit >= _NOISE_ALONE:
+        if exactly is None or exactly.misfit >= _NOISE_ALONE or exactly.unsure().max() > WEAK_SHARE:
             return thing
         more = (*exactly.alternatives, Alternative(thing.state, _AS_A_THING))
         return replace(exactly, alternatives=more, spread_factor=course.SPREAD)
