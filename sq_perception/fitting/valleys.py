@@ -15,7 +15,7 @@ Open half sizes.  The curvature of the cost tells how sure a size is where the v
 - where what the image shows leaves a size open, and priors decide.
 
 Of the first two, bodies are held at one half size after another and the rest is fitted; what the image allows adds to
-the covariance.  Of the last, bodies compete of which the size is like the other two, thin, or as predicted.
+the covariance.  Of the last, a body is predicted where someone can.
 """
 
 from __future__ import annotations
@@ -149,26 +149,20 @@ def along_view(solution: Solution) -> Solution:
 
 
 def weighed(solution: Solution) -> Solution:
-    """The solution, or a better one once half sizes that the image leaves open are left to priors and a prediction."""
-    problem, state, rays = solution.problem, solution.state, solution.rays
-    expected = problem.options.expected
+    """The solution, or a better one once half sizes that the image leaves open are left to a prediction of the body."""
+    problem, state, rays, expected = solution.problem, solution.state, solution.rays, solution.problem.options.expected
     weak = np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))
-    if len(weak) == 0 or problem.hull is not None or problem.late:
+    if len(weak) == 0 or expected is None or problem.hull is not None:
         return solution
-    rivals = [state]
-    for k in weak:
-        typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
-        rivals += [resized(state, int(k), size) for size in (typical, 0.3 * typical)]
-    if expected is not None:
-        prior = expected() if callable(expected) else expected
-        problem = replace(problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA), expected=prior)
-        solution = replace(solution, notes=(*solution.notes, "half sizes weighed against a prediction"))
-        extents = prior.support(state.rotation.T)
-        rivals += [resized(state, int(k), float(extents[k])) for k in weak]
+    prior = expected() if callable(expected) else expected
+    problem = replace(problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA), expected=prior)
+    extents = prior.support(state.rotation.T)
     few = problem.draw(SETTLE.rays, SETTLE.offset)
     few = few.weighing(rays.weight / few.weight)
+    rivals = [state, *(resized(state, int(k), float(extents[k])) for k in weak)]
     settled = by_cost(problem.settle(rival, few) for rival in rivals)
-    return replace(solution, problem=problem, state=problem.refined_best(settled, rays))
+    notes = (*solution.notes, "half sizes weighed against a prediction")
+    return replace(solution, problem=problem, state=problem.refined_best(settled, rays), notes=notes)
 
 
 def or_oval(solution: Solution) -> Solution:
