@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -191,6 +192,22 @@ def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
     centre = np.array([0.5, 0.5, 0.0])
     moved = upright.superquadric.transformed(about_view, centre - quaternions.to_matrix(about_view) @ centre)
     assert iou(turned, moved) > 0.99
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_mirrored_camera_and_another_unit_change_no_body(seed: int) -> None:
+    """Costs are in units of the noise, so that neither metres nor the side of the image count."""
+    truth = pinhole_body(np.random.default_rng(40 + seed))
+    depth, mask = pinhole_image(truth)
+    depth = depth + np.random.default_rng(seed).normal(0, 0.002, depth.shape).astype(np.float32)
+    options = FitOptions(model_error=0.0, noise=0.002)
+    size = np.sort(surface_fit.fit(depth, mask, CAMERA, options=options).superquadric.size)
+    there = replace(CAMERA, cx=CAMERA.width - 1 - CAMERA.cx)
+    mirrored = surface_fit.fit(np.fliplr(depth), np.fliplr(mask), there, options=options).superquadric.size
+    np.testing.assert_allclose(np.sort(mirrored), size, rtol=0.02)
+    larger = replace(options, noise=0.02)
+    tenfold = surface_fit.fit(depth * np.float32(10), mask, CAMERA, options=larger).superquadric.size
+    np.testing.assert_allclose(np.sort(tenfold), 10 * size, rtol=0.02)
 
 
 def table_scene(truth: Superquadric, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
