@@ -15,7 +15,7 @@ Open half sizes.  The curvature of the cost tells how sure a size is where the v
 - where what the image shows leaves a size open, and priors decide.
 
 Of the first two, bodies are held at one half size after another and the rest is fitted; what the image allows adds to
-the covariance.  Of the last, a body is predicted where someone can.
+the covariance.  Of the last, other sizes are tried, the one of a predicted body among them.
 """
 
 from __future__ import annotations
@@ -71,6 +71,8 @@ _NO_EVIDENCE = 12.5
 """Excess of a cost that is no evidence against a length: through noise its standard deviation is 7."""
 _OVAL = 0.25
 """Share of things that are not round among those of which the image does not tell."""
+_THIN = 0.3
+"""Half size, as a share of the other two, at which one that the image leaves open is also tried."""
 _EXPECTATION_SIGMA = 0.25
 """Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
 
@@ -149,19 +151,28 @@ def along_view(solution: Solution) -> Solution:
 
 
 def weighed(solution: Solution) -> Solution:
-    """The solution, or a better one once half sizes that the image leaves open are left to a prediction of the body."""
+    """The solution, or a better one once half sizes that the image leaves open are left to priors and a prediction.
+
+    Of a thing each competes with bodies of which that size is like the other two, or thin.
+    """
     problem, state, rays, expected = solution.problem, solution.state, solution.rays, solution.problem.options.expected
-    weak = np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))
-    if len(weak) == 0 or expected is None or problem.hull is not None:
+    weak = [int(k) for k in np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))]
+    if not weak or problem.hull is not None or (expected is None and problem.independent is None):
         return solution
-    prior = expected() if callable(expected) else expected
-    problem = replace(problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA), expected=prior)
-    extents = prior.support(state.rotation.T)
+    rivals, notes = [state], solution.notes
+    if problem.independent is not None:
+        for k in weak:
+            typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
+            rivals += [resized(state, k, share * typical) for share in (1.0, _THIN)]
+    if expected is not None:
+        prior = expected() if callable(expected) else expected
+        problem = replace(problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA), expected=prior)
+        extents = prior.support(state.rotation.T)
+        rivals += [resized(state, k, float(extents[k])) for k in weak]
+        notes = (*notes, "half sizes weighed against a prediction")
     few = problem.draw(SETTLE.rays, SETTLE.offset)
     few = few.weighing(rays.weight / few.weight)
-    rivals = [state, *(resized(state, int(k), float(extents[k])) for k in weak)]
     settled = by_cost(problem.settle(rival, few) for rival in rivals)
-    notes = (*solution.notes, "half sizes weighed against a prediction")
     return replace(solution, problem=problem, state=problem.refined_best(settled, rays), notes=notes)
 
 
