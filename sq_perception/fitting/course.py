@@ -193,8 +193,7 @@ def thing(problem: Problem, starts: Sequence[State]) -> Solution:
     if misfit > 1.0 and problem.hull is not None:
         terms = problem.terms._replace(hull_root=problem.hull.root(misfit))
         drawn = replace(problem, independent=INDEPENDENT / misfit, terms=terms)
-    if not problem.late:
-        settled = drawn.search(settled, THING[1:])
+        settled = settled if problem.late else drawn.search(settled, THING[1:])
     rays = drawn.draw(problem.options.pixels or SAMPLE, 0.3)
     spread = SPREAD if problem.hull is None else 1.0
     solution = Solution(drawn, drawn.refined_best(settled, rays), rays, spread_factor=spread)
