@@ -18,13 +18,13 @@ _LEAST_SQUARE = 1e-18
 
 
 def floating(part: Any) -> np.ndarray:
-    """An array of single or double precision."""
+    """Return an array of single or double precision."""
     part = np.asarray(part)
     return part if part.dtype == np.float64 else part.astype(np.result_type(part.dtype, np.float32), copy=False)
 
 
 def one_body(parts: list[Any]) -> np.ndarray | None:
-    """Size, shape, translation, rotation, made a unit quaternion, and taper of a single NumPy body: read-only, (14,).
+    """Check size, shape, translation, rotation, which becomes a unit quaternion, and taper of one NumPy body: (14,).
 
     So few numbers are checked ten times as fast in Python.  None for anything else, numbers of no body included.
     """
@@ -48,7 +48,7 @@ def one_body(parts: list[Any]) -> np.ndarray | None:
 
 
 def checked_turn(parts: list[np.ndarray]) -> np.ndarray:
-    """The rotation (..., 4) of size, shape, translation, rotation and taper, made unit quaternions.
+    """Check size, shape, translation, rotation and taper; return unit quaternions (..., 4).
 
     Raises ValueError unless these are the numbers of bodies.
     """

@@ -43,7 +43,7 @@ def compile_beside() -> None:
 
 
 def compile_kernel(function: _F, options: dict[str, Any]) -> _F:
-    """numba's ``njit`` with these options, its machine code kept wherever there is a place."""
+    """Compile by numba's ``njit`` with these options, and cache the machine code wherever possible."""
     settings: Any = numba.config
     named = settings.CACHE_DIR
     try:
@@ -65,7 +65,7 @@ def compile_kernel(function: _F, options: dict[str, Any]) -> _F:
 
 
 class _Compiling(Listener):
-    """Hears of kernels that are compiled, as they are not on disk."""
+    """Log handler for kernels that are compiled because they are not on disk."""
 
     def on_start(self, event: Event) -> None:
         if event.data["dispatcher"].py_func.__module__.startswith(__package__.partition(".")[0]):
@@ -97,7 +97,7 @@ register("numba:compile", _Compiling())
 
 @cache
 def temporary_folder() -> Path | None:
-    """A folder that belongs to this user alone and outlives the process, or None; logs once what that means."""
+    """Return a folder of this user alone that outlives the process, or None; log once what that means."""
     try:
         path = Path(tempfile.gettempdir()) / f"sq_perception-kernels-{os.geteuid()}"
         path.mkdir(mode=0o700, exist_ok=True)

@@ -15,7 +15,7 @@ MEDIAN_TO_SIGMA = 1.4826
 
 
 def quantile(numbers: np.ndarray, share: float) -> float:
-    """The value below which a share (0 to 1) of some numbers (n >= 1,) lies, between two of them linearly."""
+    """Return the value below which a share (0 to 1) of some numbers (n >= 1,) lies, linearly interpolated."""
     place = share * (len(numbers) - 1)
     before = int(place)
     after = min(before + 1, len(numbers) - 1)
@@ -25,13 +25,12 @@ def quantile(numbers: np.ndarray, share: float) -> float:
 
 
 def deviation(sizes: np.ndarray) -> float:
-    """The standard deviation of normal numbers with mean 0 whose absolute values are these (n >= 1,); outliers hardly
-    change it."""
+    """Estimate the standard deviation of zero-mean normal numbers from absolute values (n >= 1,), robustly."""
     return MEDIAN_TO_SIGMA * quantile(sizes, 0.5)
 
 
 def densest(ordered: np.ndarray, width: float) -> slice:
-    """The slice of ordered numbers (n,) with most of them within ``width`` of its first; the first such slice."""
+    """Return the slice of sorted numbers (n,) with most of them within ``width`` of its first; the first such."""
     if not len(ordered):
         return slice(0)
     counts = np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered))
@@ -41,7 +40,7 @@ def densest(ordered: np.ndarray, width: float) -> slice:
 
 @kernel
 def select(numbers: np.ndarray, rank: int) -> float:
-    """The number of float32 (n,) >= 0 that comes after ``rank`` others in rising order.
+    """Return the float32 of (n,) >= 0 with ``rank`` others before it in ascending order.
 
     Their bits, read as whole numbers, have the same order; a count of the upper halves finds the upper half of the
     wanted one, and a second count the lower half.

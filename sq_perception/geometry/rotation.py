@@ -28,7 +28,7 @@ def normalize(quaternion: Array) -> Array:
 
 
 def multiply(left: Array, right: Array) -> Array:
-    """Hamilton product (..., 4): first the right rotation, then the left one."""
+    """Return the Hamilton product (..., 4): first the right rotation, then the left one."""
     x1, y1, z1, w1 = _components(left)
     x2, y2, z2, w2 = _components(right)
     product = [
@@ -41,13 +41,13 @@ def multiply(left: Array, right: Array) -> Array:
 
 
 def conjugate(quaternion: Array) -> Array:
-    """The inverse of unit quaternions (..., 4)."""
+    """Return the inverse of unit quaternions (..., 4)."""
     xp = array_namespace(quaternion)
     return xp.concat([-quaternion[..., :3], quaternion[..., 3:]], axis=-1)
 
 
 def to_matrix(quaternion: Array) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any non-zero length (thesis, equation 3.8)."""
+    """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any non-zero length (thesis, equation 3.8)."""
     q = normalize(quaternion)
     x, y, z, w = _components(q)
     entries = [
@@ -65,7 +65,7 @@ def to_matrix(quaternion: Array) -> Array:
 
 
 def from_matrix(matrix: Array) -> Array:
-    """Unit quaternions (..., 4) of rotation matrices (..., 3, 3).
+    """Return unit quaternions (..., 4) of rotation matrices (..., 3, 3).
 
     The four products 4 q_i q_j are read off the matrix for each choice of i; the row with the largest q_i is the well
     conditioned one (Shepperd 1978).  Only that row is divided by its root, so gradients stay finite for every rotation.
@@ -83,7 +83,7 @@ def from_matrix(matrix: Array) -> Array:
 
 
 def _products(m: list[list[Any]]) -> tuple[list[Any], list[list[Any]]]:
-    """The products 4 q_i q_j of the quaternion of a matrix: those of i = j, and the rows of all."""
+    """Return the products 4 q_i q_j of a matrix's quaternion: those of i = j, and the rows of all."""
     xx, yy = 1 + m[0][0] - m[1][1] - m[2][2], 1 - m[0][0] + m[1][1] - m[2][2]
     zz, ww = 1 - m[0][0] - m[1][1] + m[2][2], 1 + m[0][0] + m[1][1] + m[2][2]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
@@ -92,7 +92,7 @@ def _products(m: list[list[Any]]) -> tuple[list[Any], list[list[Any]]]:
 
 
 def from_rotation_vector(vector: Array) -> Array:
-    """Unit quaternions (..., 4) of rotation vectors (..., 3): axis times angle in radians, smooth through zero."""
+    """Return unit quaternions (..., 4) of rotation vectors (..., 3), axis times angle, smooth through zero."""
     xp = array_namespace(vector)
     square = xp.sum(vector * vector, axis=-1, keepdims=True)
     small = square < 1e-12
@@ -103,7 +103,7 @@ def from_rotation_vector(vector: Array) -> Array:
 
 
 def to_rotation_vector(quaternion: Array) -> Array:
-    """Rotation vectors (..., 3) of unit quaternions (..., 4): the shorter way, at most pi, smooth through zero."""
+    """Return rotation vectors (..., 3) of unit quaternions (..., 4), at most pi long, smooth through zero."""
     xp = array_namespace(quaternion)
     sign = xp.where(quaternion[..., 3:] < 0, -xp.ones_like(quaternion[..., 3:]), xp.ones_like(quaternion[..., 3:]))
     vector, cosine = sign * quaternion[..., :3], sign * quaternion[..., 3:]
@@ -114,7 +114,7 @@ def to_rotation_vector(quaternion: Array) -> Array:
 
 
 def from_six(six: Array) -> Array:
-    """Unit quaternions (..., 4) of the 6D form (..., 6), two columns made orthonormal (Zhou et al. 2019)."""
+    """Return unit quaternions (..., 4) of the 6D form (..., 6), two orthonormalised columns (Zhou et al. 2019)."""
     xp = array_namespace(six)
     first = _unit(six[..., :3])
     second = six[..., 3:]
@@ -124,14 +124,14 @@ def from_six(six: Array) -> Array:
 
 
 def cross(left: Array, right: Array) -> Array:
-    """Vector product of (..., 3) arrays."""
+    """Return the vector product of (..., 3) arrays."""
     a1, a2, a3 = _components(left)
     b1, b2, b3 = _components(right)
     return _join([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], left, right)
 
 
 def random(count: int, rng: np.random.Generator) -> np.ndarray:
-    """``count`` uniformly distributed rotations as quaternions (count, 4) (Shoemake 1992)."""
+    """Draw ``count`` uniformly distributed rotations as quaternions (count, 4) (Shoemake 1992)."""
     u = rng.random((count, 3))
     inner, outer = np.sqrt(1 - u[:, 0]), np.sqrt(u[:, 0])
     a, b = 2 * math.pi * u[:, 1], 2 * math.pi * u[:, 2]
@@ -139,7 +139,7 @@ def random(count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def geodesic_angle(left: Array, right: Array) -> Array:
-    """Angle in radians, 0 to pi, of the rotation between two unit quaternions (..., 4)."""
+    """Return the angle in radians, 0 to pi, of the rotation between two unit quaternions (..., 4)."""
     xp = array_namespace(left, right)
     difference = multiply(conjugate(left), right)
     vector = xp.sqrt(xp.sum(difference[..., :3] ** 2, axis=-1))
@@ -147,17 +147,17 @@ def geodesic_angle(left: Array, right: Array) -> Array:
 
 
 def _is_one(array: Array) -> bool:
-    """Whether this is a single NumPy vector: Python computes with its numbers ten times as fast as NumPy does."""
+    """Return whether this is one NumPy vector: Python computes with its numbers ten times as fast as NumPy."""
     return isinstance(array, np.ndarray) and array.ndim == 1
 
 
 def _components(array: Array) -> Any:
-    """The entries along the last axis: numbers of a single NumPy vector, arrays of others."""
+    """Return the entries along the last axis: numbers of one NumPy vector, arrays otherwise."""
     return array.tolist() if _is_one(array) else [array[..., k] for k in range(array.shape[-1])]
 
 
 def _join(components: list[Any], *parts: Array) -> Array:
-    """One array of components that were computed from those of ``parts``."""
+    """Join components that were computed from those of ``parts`` in one array."""
     if type(components[0]) in (float, int):
         return np.array(components, dtype=np.result_type(*parts))
     return array_namespace(*parts).stack(components, axis=-1)

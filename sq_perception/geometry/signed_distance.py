@@ -43,7 +43,7 @@ _OF_COVARIANCE = 11
 def signed_distance(
     body: Any, points: np.ndarray, covariance: np.ndarray | None = None, k_sigma: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A lower bound of the signed distance of points to bodies, and its gradient.
+    """Return a lower bound of the signed distance of points to bodies, and its gradient.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def _bounded(
 
 @kernel
 def _deviation(mx: float, my: float, mz: float, body: np.ndarray, turn: np.ndarray, covariance: np.ndarray) -> float:
-    """Standard deviation of the distance to the support plane with the normal (mx, my, mz) in the object's frame."""
+    """Return the sigma of the distance to the support plane with the normal (mx, my, mz) in the object's frame."""
     a1, a2, a3 = body[0], body[1], body[2]
     _, sx, sy, sz, h_e1, h_e2, _, _ = support_derivatives(mx, my, mz, a1, a2, a3, body[3], body[4], body[12], body[13])
     slope = np.empty(_OF_COVARIANCE)

@@ -64,7 +64,7 @@ _QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
 
 @dataclass(frozen=True, eq=False)
 class Superquadric:
-    """One superquadric or a batch of them, in NumPy or in torch.
+    """A superquadric or a batch of them, in NumPy or in torch.
 
     Attributes
     ----------
@@ -146,7 +146,7 @@ class Superquadric:
         return bool((self.taper != 0).any())
 
     def to_flat(self) -> Array:
-        """Flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw.
+        """Return flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw.
 
         Raises
         ------
@@ -158,13 +158,13 @@ class Superquadric:
         return self.to_numbers()[..., :FLAT_LENGTH]
 
     def to_numbers(self) -> Array:
-        """All parameters (..., 14): those of :meth:`to_flat`, then k_x k_y."""
+        """Return all parameters (..., 14): those of :meth:`to_flat`, then k_x k_y."""
         xp = array_namespace(self.size)
         return xp.concat([self.size, self.shape, self.translation, self.rotation, self.taper], axis=-1)
 
     @classmethod
     def from_flat(cls, flat: Array) -> Superquadric:
-        """The inverse of :meth:`to_flat` and, for arrays (..., 14), of :meth:`to_numbers`."""
+        """Invert :meth:`to_flat` and, for arrays (..., 14), :meth:`to_numbers`."""
         if not is_torch_array(flat):
             flat = np.asarray(flat, dtype=float)
         if flat.ndim == 0 or flat.shape[-1] not in (FLAT_LENGTH, NUMBERS):
@@ -174,29 +174,29 @@ class Superquadric:
 
     @classmethod
     def at_origin(cls, size: np.ndarray, shape: np.ndarray, taper: np.ndarray | None = None) -> Superquadric:
-        """Bodies of these sizes (..., 3), exponents (..., 2) and tapers (..., 2) in their own frame."""
+        """Make bodies of these sizes (..., 3), exponents (..., 2) and tapers (..., 2) in their own frame."""
         size, shape = np.asarray(size, float), np.asarray(shape, float)
         return cls(size, shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), taper)
 
     @classmethod
     def stack(cls, bodies: list[Superquadric]) -> Superquadric:
-        """A batch (n, ...) of equally shaped bodies; an empty list gives an empty NumPy batch."""
+        """Stack equally shaped bodies to a batch (n, ...); an empty list gives an empty NumPy batch."""
         if not bodies:
             return cls(np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 4)))
         xp = array_namespace(bodies[0].size)
         return cls.from_flat(xp.stack([body.to_numbers() for body in bodies]))
 
     def untapered(self) -> Superquadric:
-        """The bodies without their tapers, all sections as large as at the wide end: they enclose the tapered ones."""
+        """Return the bodies without taper, all sections as large as at the wide end: they enclose the tapered ones."""
         return Superquadric(self.size * self._largest(), self.shape, self.translation, self.rotation)
 
     def with_taper(self, taper: Array) -> Superquadric:
-        """The inverse of :meth:`untapered`, for untapered bodies."""
+        """Invert :meth:`untapered`, for untapered bodies."""
         shaped = Superquadric(self.size, self.shape, self.translation, self.rotation, taper)
         return Superquadric(self.size / shaped._largest(), self.shape, self.translation, self.rotation, taper)
 
     def _largest(self) -> Array:
-        """Half sizes (..., 3) at the wide end, as multiples of those in the middle."""
+        """Return half sizes (..., 3) at the wide end, as multiples of those in the middle."""
         xp = array_namespace(self.size)
         return 1 + xp.concat([xp.abs(self.taper), 0 * self.taper[..., :1]], axis=-1)
 
@@ -204,20 +204,20 @@ class Superquadric:
 
     @property
     def rotation_matrix(self) -> Array:
-        """Object to parent, (..., 3, 3)."""
+        """Return the rotation from object to parent, (..., 3, 3)."""
         return quaternions.to_matrix(self.rotation)
 
     def to_object(self, points: Array) -> Array:
-        """Points (..., N, 3) of the parent frame in the object's frame."""
+        """Transform points (..., N, 3) from the parent frame to the object's frame."""
         return (points - self.translation[..., None, :]) @ self.rotation_matrix
 
     def to_parent(self, points: Array) -> Array:
-        """Points (..., N, 3) of the object's frame in the parent frame."""
+        """Transform points (..., N, 3) from the object's frame to the parent frame."""
         xp = array_namespace(points)
         return points @ xp.linalg.matrix_transpose(self.rotation_matrix) + self.translation[..., None, :]
 
     def transformed(self, rotation: Array, translation: Array, scale: float | Array = 1.0) -> Superquadric:
-        """The same body in another frame: p_new = scale * R(rotation) p + translation.
+        """Return the same body in another frame: p_new = scale * R(rotation) p + translation.
 
         Half sizes grow with ``scale`` (a number, or an array (..., 1)); shape and taper stay.
         """
@@ -229,7 +229,7 @@ class Superquadric:
     # The surface
 
     def gauge(self, points: Array) -> Array:
-        """g at points (..., N, 3) of the parent frame, shape (..., N); 1 on the surface."""
+        """Return g at points (..., N, 3) of the parent frame, shape (..., N); 1 on the surface."""
         p = self.to_object(points)
         xp = array_namespace(p)
         q = xp.abs(p) / self.size[..., None, :]
@@ -238,7 +238,7 @@ class Superquadric:
         return nested_norm(q[..., 0] / scale[..., 0], q[..., 1] / scale[..., 1], q[..., 2], e1, e2)
 
     def _section(self, points: Array) -> Array:
-        """Scale (..., N, 2) of the sections at points (..., N, 3) of the object's frame."""
+        """Return the scale (..., N, 2) of the sections at points (..., N, 3) of the object's frame."""
         xp = array_namespace(points)
         high = (points[..., 2] / self.size[..., None, 2])[..., None]
         taper = self.taper[..., None, :]
@@ -246,38 +246,38 @@ class Superquadric:
         return xp.where(scale >= narrow, scale, narrow)  # no maximum: its gradient is half where both are 1
 
     def inside_outside(self, points: Array) -> Array:
-        """F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow to inf far from sharp bodies."""
+        """Return F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow far from sharp bodies."""
         return self.gauge(points) ** (2 / self.shape[..., None, 0])
 
     def adjusted_inside_outside(self, points: Array) -> Array:
-        """F^e1 = g^2 at points (..., N, 3), shape (..., N) (thesis, equation 6.4)."""
+        """Return F^e1 = g^2 at points (..., N, 3), shape (..., N) (thesis, equation 6.4)."""
         return self.gauge(points) ** 2
 
     def occupancy(self, points: Array, sharpness: float | Array) -> Array:
-        """Soft occupancy sigma(s (1 - F^e1)) at points (..., N, 3), in (0, 1) (thesis, equation 6.6)."""
+        """Return soft occupancy sigma(s (1 - F^e1)) at points (..., N, 3), in (0, 1) (thesis, equation 6.6)."""
         xp = array_namespace(points)
         exponent = xp.clip(-sharpness * (1 - self.adjusted_inside_outside(points)), -60.0, 60.0)
         return 1 / (1 + xp.exp(exponent))
 
     def gauge_gradient(self, points: Array) -> Array:
-        """Gradient of g at points (..., N, 3) in the parent frame, shape (..., N, 3); zero at the centre."""
+        """Return the gradient of g at points (..., N, 3) in the parent frame, shape (..., N, 3); zero at the centre."""
         return self._gauge_and_gradient(points)[1]
 
     def normals(self, points: Array) -> Array:
-        """Outward unit normals at surface points (..., N, 3) in the parent frame, shape (..., N, 3)."""
+        """Return outward unit normals at surface points (..., N, 3) in the parent frame, shape (..., N, 3)."""
         gradient = self.gauge_gradient(points)
         xp = array_namespace(gradient)
         return gradient / xp.sqrt(xp.sum(gradient * gradient, axis=-1, keepdims=True))
 
     def sampson_distance(self, points: Array) -> Array:
-        """First order distance (g - 1) / |grad g| of points (..., N, 3) to the surface, metres, positive outside."""
+        """Return (g - 1) / |grad g| of points (..., N, 3), the first order distance, metres, positive outside."""
         gauge, gradient = self._gauge_and_gradient(points)
         xp = array_namespace(gradient)
         length = xp.sqrt(xp.sum(gradient * gradient, axis=-1))
         return (gauge - 1) / xp.where(length > 0, length, xp.ones_like(length))
 
     def signed_distance(self, points: np.ndarray, *, gradient: bool = False) -> Any:
-        """A lower bound of the signed distance of points (N, 3), metres, negative inside; NumPy bodies only.
+        """Return a lower bound of the signed distance of points (N, 3), metres, negative inside; NumPy only.
 
         Of the nearest body of a batch (k,), shape (N,), and with ``gradient`` its gradient (N, 3) too.  The bound, and
         where it is exact: :mod:`sq_perception.geometry.signed_distance`.
@@ -303,7 +303,7 @@ class Superquadric:
         return gauge, gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
 
     def parametric_points(self, eta: Array, omega: Array) -> Array:
-        """Surface points (..., N, 3) in the parent frame at angles (N,) (thesis, equation 3.5).
+        """Return surface points (..., N, 3) in the parent frame at angles (N,) (thesis, equation 3.5).
 
         ``eta`` in [-pi/2, pi/2] runs from pole to pole, ``omega`` in [-pi, pi) around z.
         """
@@ -323,7 +323,7 @@ class Superquadric:
         return self.to_parent(unit * self.size[..., None, :])
 
     def sample_surface(self, count: int, rng: np.random.Generator, oversampling: int = 12) -> np.ndarray:
-        """Nearly uniform surface points (..., count, 3) in the parent frame; NumPy bodies only.
+        """Return nearly uniform surface points (..., count, 3) in the parent frame; NumPy only.
 
         Random directions v on the sphere, stretched by the half sizes, hit the untapered surface at p = a v / g.  Such
         a point stands for the area a1 a2 a3 r^3 |grad g| (r = 1 / g(a v), from the volume of a thin cone), so that
@@ -352,7 +352,8 @@ class Superquadric:
     # Closed forms
 
     def volume(self) -> np.ndarray:
-        """Volume (...), cubic metres, of NumPy bodies: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2) (1 + k_x k_y m).
+        """Return the volume (...), m^3, of NumPy bodies: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2) (1 + k_x k_y
+        m).
 
         m = B(3 e1/2, e1 + 1) / B(e1/2, e1 + 1) is the mean of (z/a3)^2 over the untapered body.
         """
@@ -364,7 +365,7 @@ class Superquadric:
         return straight * (1 + np.prod(self.taper, axis=-1) * beta(1.5 * e1, e1 + 1) / beta(0.5 * e1, e1 + 1))
 
     def support(self, directions: Array) -> Array:
-        """Support function: max of n.p over the body, minus n.t, for unit directions n (..., N, 3), shape (..., N).
+        """Return the support function, max of n.p over the body minus n.t, for unit n (..., N, 3), shape (..., N).
 
         The dual of the gauge: the same nested norm of a * |R^T n| with each exponent p = 2/e replaced by its conjugate
         2/(2 - e), that is e by 2 - e, but for octahedra.  The body touches the plane n.p = n.t + support.
@@ -380,7 +381,7 @@ class Superquadric:
         return nested_norm(q[..., 0], q[..., 1], q[..., 2], conjugate[..., 0], conjugate[..., 1])
 
     def bounding_box(self) -> tuple[Array, Array]:
-        """Lower and upper corner (..., 3) of the axis-aligned box in the parent frame."""
+        """Return lower and upper corner (..., 3) of the axis-aligned box in the parent frame."""
         xp = array_namespace(self.size)
         ways = xp.eye(3, dtype=self.size.dtype)
         above = self.support(ways)
@@ -390,7 +391,7 @@ class Superquadric:
     # The same body, other numbers
 
     def equivalent_forms(self) -> Superquadric:
-        """The 8 parameter vectors of the same body, batch shape (8, ...).
+        """Return the 8 parameter vectors of the same body, batch shape (8, ...).
 
         Half turns about x, y, z and none, then the same four after a quarter turn about z with a1 and a2 exchanged.
         """
@@ -407,7 +408,7 @@ class Superquadric:
         return Superquadric.from_flat(xp.stack(forms))
 
     def canonical_form(self) -> Superquadric:
-        """The representative of the 8 forms with a1 >= a2, then the smallest rotation angle, then qw >= 0.
+        """Return the form of the 8 with a1 >= a2, then the smallest rotation angle, then qw >= 0.
 
         NumPy bodies only.  A half turn about an axis moves that axis' component of the quaternion to qw, up to sign, so
         that the largest component names the half turn of the smallest angle; among equals qw, then x, y, z wins.
@@ -435,7 +436,7 @@ class Superquadric:
 
 
 def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) -> Array:
-    """Support (..., N) of tapered bodies: the largest one of their sections.
+    """Return the support (..., N) of tapered bodies: the largest of their sections.
 
     The section at z = t a3 has n_z a3 t + sigma S(t): (t, sigma) runs on the profile, a unit ball, and S is the dual
     norm of (a1 f1 n_x, a2 f2 n_y).  Along the profile, t = +-sin^e1(w) and sigma = cos^e1(w), octahedra have several
@@ -474,21 +475,21 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
 
 
 def nested_norm(x: Array, y: Array, z: Array, e1: Array, e2: Array) -> Array:
-    """|| ( || (x, y) ||_{2/e2}, z ) ||_{2/e1} for x, y, z >= 0: the gauge at (x, y, z) in units of the half sizes."""
+    """Return || ( || (x, y) ||_{2/e2}, z ) ||_{2/e1} for x, y, z >= 0: the gauge in units of the half sizes."""
     return p_norm(p_norm(x, y, e2), z, e1)
 
 
 def nested_norm_and_slopes(
     x: Array, y: Array, z: Array, e1: Array, e2: Array
 ) -> tuple[Array, tuple[Array, Array, Array]]:
-    """The nested norm and its partial derivatives with respect to x, y and z."""
+    """Return the nested norm and its partial derivatives with respect to x, y and z."""
     h, h_x, h_y = _p_norm_and_slopes(x, y, e2)
     g, g_h, g_z = _p_norm_and_slopes(h, z, e1)
     return g, (g_h * h_x, g_h * h_y, g_z)
 
 
 def p_norm(u: Array, v: Array, e: Array) -> Array:
-    """(u^(2/e) + v^(2/e))^(e/2) for u, v >= 0, elementwise, in ratio form.
+    """Return (u^(2/e) + v^(2/e))^(e/2) for u, v >= 0, elementwise, in ratio form.
 
     Guarded twice, so that neither value nor gradient is anything but finite at u = 0, v = 0 or both.
     """
@@ -498,7 +499,7 @@ def p_norm(u: Array, v: Array, e: Array) -> Array:
 
 
 def _ratio_form(u: Array, v: Array, e: Array) -> tuple[Array, Array]:
-    """The larger of u and v, and (smaller / larger)^(2/e)."""
+    """Return the larger of u and v, and (smaller / larger)^(2/e)."""
     xp = array_namespace(u, v)
     big, small = xp.maximum(u, v), xp.minimum(u, v)
     ratio = small / xp.where(big > 0, big, xp.ones_like(big))
@@ -509,7 +510,7 @@ def _ratio_form(u: Array, v: Array, e: Array) -> tuple[Array, Array]:
 
 
 def _p_norm_and_slopes(u: Array, v: Array, e: Array) -> tuple[Array, Array, Array]:
-    """The p-norm and its partial derivatives with respect to u and v."""
+    """Return the p-norm and its partial derivatives with respect to u and v."""
     big, power = _ratio_form(u, v, e)
     xp = array_namespace(big)
     log_sum = xp.log1p(power)

@@ -14,7 +14,7 @@ _GOLDEN = (1 + np.sqrt(5)) / 2
 
 
 def _icosphere() -> np.ndarray:
-    """The corners (12, 3) of a regular icosahedron, then the middles (30, 3) of its edges, all of length 1."""
+    """Return the corners (12, 3) of a regular icosahedron, then the middles (30, 3) of its edges, of length 1."""
     corners = np.array([[0, a, b * _GOLDEN] for a in (1, -1) for b in (1, -1)])
     corners = np.concatenate([np.roll(corners, k, axis=1) for k in range(3)])
     edge = 2.0
@@ -31,6 +31,6 @@ DIRECTIONS = _icosphere()
 
 
 def mirrored(axis: int) -> np.ndarray:
-    """Indices (42,) of where directions go when coordinate ``axis`` changes its sign; its own inverse."""
+    """Return indices (42,) of the directions after coordinate ``axis`` changes its sign; its own inverse."""
     image = DIRECTIONS * np.where(np.arange(3) == axis, -1, 1)
     return np.asarray(np.argmax(image @ DIRECTIONS.T, axis=1))
