@@ -9,7 +9,7 @@ from sq_perception.simulation.sample import sample
 frame = sample()
 found = sq.Recoverer().recover(frame.depth, frame.camera).recovered
 bodies = sq.Superquadric.stack([body.superquadric for body in found])
-grown = scene_export.grown(bodies, np.array([body.covariance for body in found]), sigmas=2.0)
+grown = scene_export.inflate(bodies, np.array([body.covariance for body in found]), sigmas=2.0)
 for form in ("urdf", "sdf", "mjcf", "curobo"):
     (path,) = scene_export.write(grown, f"table{scene_export.SUFFIXES[form]}", form, frame="camera")
     print(path, [solid.kind for solid in scene_export.solids(grown, form)])

@@ -31,7 +31,6 @@ COMMANDS = {
     "train-things": ("shards:train_things", "train the network that predicts the unseen side of things"),
     "segment-views": ("shards:segment_views", "draw segments of simulated scenes to train on"),
     "train-masks": ("shards:train_masks", "train the network that finds outliers in segments"),
-    "dataset": ("dataset:main", "write a fixed set of training and test images"),
     "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
     "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("warm_up:main", "compile all kernels in advance"),

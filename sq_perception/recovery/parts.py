@@ -116,7 +116,8 @@ class Search:
         self.parts: Parts | None = None
         """The best ones so far; None where one body is the shorter description."""
         self._divisions: Iterator[list[SeenObject]] = iter(())
-        if alone.status == Status.FAILED or not (camera.is_pinhole and np.isfinite(alone.noise)):
+        is_enough = alone.status != Status.FAILED and obj.pixels >= 2 * MIN_PIXELS
+        if not (is_enough and camera.is_pinhole and np.isfinite(alone.noise)):
             return
         self._evidence = Evidence.of(obj, depth, camera, alone.noise)
         weight = self._evidence.weigh([alone])
