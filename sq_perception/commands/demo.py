@@ -78,13 +78,13 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
     print(f"{len(shots)} images of a simulated RealSense D435, {count} bodies on tables\n")
     print(f"{'':15}{'found':>9}{'IoU mean':>11}{'worst':>8}{'stamp to result':>18}")
     for node, title in _METHODS.items():
-        pairs = [pair for shot in shots for pair in pair(shot.truth, shot.found[node])]
+        pairs = [pair for shot in shots for pair in match(shot.truth, shot.found[node])]
         overlaps = [100 * overlap for found, overlap in pairs if found is not None] or [0.0]
         delay = np.median([shot.delay[node] for shot in shots])
         share = 100 * len(overlaps) / count
         print(f"{title:15}{share:7.0f} %{np.mean(overlaps):9.1f} %{min(overlaps):6.0f} %{delay:15.0f} ms")
     last = shots[-1]
-    columns = {title: pair(last.truth, last.found[node]) for node, title in _METHODS.items()}
+    columns = {title: match(last.truth, last.found[node]) for node, title in _METHODS.items()}
     print("\nthe last image, full edges in mm, shortest first")
     print(f"   {'true':22}" + "".join(f"{title:30}" for title in columns))
     for k, body in enumerate(last.truth):
@@ -100,7 +100,7 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
     print("\n" + _SHOWN.format(picture=picture, mesh=mesh))
 
 
-def pair(truth: Superquadric, found: Superquadric) -> list[tuple[Superquadric | None, float]]:
+def match(truth: Superquadric, found: Superquadric) -> list[tuple[Superquadric | None, float]]:
     """Return the best overlapping found body (m,) of each true body (n,) and their IoU; None for no overlap."""
     from sq_perception.geometry.metrics import volume_iou
 

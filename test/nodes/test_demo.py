@@ -15,7 +15,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
 
-from sq_perception.commands.demo import pair
+from sq_perception.commands.demo import match
 from sq_perception.evaluation.demo_figure import demo_figure
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
@@ -34,23 +34,23 @@ def boxes(*centres: float) -> Superquadric:
 
 def test_the_same_bodies_in_another_order_are_paired_with_full_overlap() -> None:
     truth = boxes(0.0, 0.3, 0.6)
-    for body, (found, overlap) in zip(truth, pair(truth, truth[np.array([2, 0, 1])]), strict=True):
+    for body, (found, overlap) in zip(truth, match(truth, truth[np.array([2, 0, 1])]), strict=True):
         assert found is not None
         np.testing.assert_array_equal(found.to_flat(), body.to_flat())
         assert overlap == 1.0
 
 
 def test_what_overlaps_nothing_is_no_partner() -> None:
-    (first, _), (second, overlap) = pair(boxes(0.0, 0.5), boxes(0.0, 5.0))
+    (first, _), (second, overlap) = match(boxes(0.0, 0.5), boxes(0.0, 5.0))
     assert first is not None
     assert (second, overlap) == (None, 0.0)
-    assert pair(boxes(0.0), boxes()) == [(None, 0.0)]
+    assert match(boxes(0.0), boxes()) == [(None, 0.0)]
 
 
 def test_two_blocks_that_overlap_by_half_have_an_iou_of_a_third() -> None:
     block = Superquadric(np.full((1, 3), 0.1), np.full((1, 2), 0.02), np.zeros((1, 3)), IDENTITY[None])
     moved = Superquadric(block.size, block.shape, np.array([[0.1, 0.0, 0.0]]), block.rotation)
-    ((_, overlap),) = pair(block, moved)
+    ((_, overlap),) = match(block, moved)
     assert overlap == pytest.approx(1 / 3, abs=0.03)
 
 
