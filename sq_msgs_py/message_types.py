@@ -26,4 +26,7 @@ def installed(name: str) -> Callable[..., Any]:
         Where that package is not installed.
     """
     package, folder, short = name.split("/")
-    return resolve_name(f"{package}.{folder}:{short}")
+    try:
+        return resolve_name(f"{package}.{folder}:{short}")
+    except AttributeError as error:  # a folder of that name, such as a package's source, imports as an empty package
+        raise ModuleNotFoundError(f"{package}/{folder} has no {short}: it is not built", name=package) from error
