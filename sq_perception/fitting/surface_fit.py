@@ -51,22 +51,22 @@ from sq_perception.imaging.regions import box, fills
 __all__ = ["FitOptions", "fit", "warm_up"]
 
 _FINE_NOISE = 0.1
-"""Noise, as a share of how far things stray from superquadrics, below which the exact course goes first: the tolerant
-one may then leave more than the noise even of a true superquadric.  Under more, it left 0.5 to 0.8 of the noise on true
+"""Noise, as a share of how far things stray from superquadrics, below which a superquadric is sought too: a thing's body
+may then leave more than the noise even of a true superquadric.  Under more noise it left 0.5 to 0.8 of it on true
 superquadrics, and 1.2 and more on things of benchmarks/household_things."""
 _MODEL_SHARE = 0.04
 """How far a small thing may stray, as a share of the side of a square whose area is that of its pixels: household
 things of 6 cm and more stray by :data:`~sq_perception.fitting.options.MODEL_ERROR`, and no more."""
 _NOISE_ALONE = 1.06
 """Mean squared residual up to which a thing is taken for a superquadric.  19 in 20 superquadrics under independent
-noise left less.  Things that left more got worse bodies from the exact course; under a time-of-flight camera, which
+noise left less.  Things that left more got worse bodies as superquadrics; under a time-of-flight camera, which
 mixes depths at edges, nearly all do."""
 _UNFINISHED = 1.06
 """Mean squared residual up to which a search that the time budget ended has come near the noise.  Of 30 bodies of the
 thesis' protocol and 120 on tables, all but one in thirty below it erred by less than three standard deviations, and
 nine in ten above it by more, typically by 5 to 40."""
 _AS_A_THING = 0.5
-"""Weight of the tolerant course's body as an alternative to an exact one: a thing that a superquadric explains may
+"""Weight of the thing's body as an alternative to the superquadric: a thing that a superquadric explains may
 stray from one where nothing was seen, or by less than the noise.  Chosen: on 217 things of benchmarks/household_things
 (60 scenes from seed 54200 on) under 10 mm of noise, 11 % of the half sizes of converged bodies erred by more than three
 standard deviations, with this weight 3 %."""
@@ -243,7 +243,7 @@ def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution 
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:
-    """Whether a tolerant solution leaves less than the noise, so that an exact one may exist."""
+    """Return whether a thing's body leaves less than the noise, so that a superquadric may explain the image."""
     return deviation(np.abs(solution.distances)) < noise
 
 

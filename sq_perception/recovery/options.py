@@ -40,7 +40,7 @@ class RecoveryOptions(SegmentationOptions):
         Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
     free_space
         Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
-        made of a cloud.  Without it things are fitted by the tolerant course.
+        made of a cloud.  Without it objects are fitted as things, with a model error.
     repair
         Part and join own segments, drop those of no object, and leave outliers out of fits, by a network; with the
         method ``auto`` and a network that predicts hulls alone.  Masks from outside stay as they are.

@@ -216,8 +216,10 @@ def test_a_thing_cut_short_is_no_surer_than_one_with_time(
         for budget in (math.inf, 1e-9)
     )
     assert "time budget" in hasty.message
-    typical = [np.exp(np.log(fit.sigma_size).mean()) for fit in (hasty, patient)]  # z may be another axis
-    assert typical[0] > 0.9 * typical[1]
+    by_length = [fit.sigma_size[np.argsort(fit.superquadric.size)] for fit in (hasty, patient)]  # z may be another axis
+    assert np.exp(np.log(by_length[0] / by_length[1]).mean()) > 0.9
+    if not (by_length[0] > 0.9 * by_length[1]).all():
+        pytest.xfail("along one axis a thing cut short is surer than one with time")
 
 
 def test_no_form_of_a_hull_is_compiled_for(

@@ -53,9 +53,11 @@ def test_a_bottle_that_no_superquadric_explains_is_as_deep_as_it_is_wide() -> No
     neck = Superquadric([0.015, 0.015, 0.11], [0.1, 1.0], foot.translation + 0.05 * NORMAL, foot.rotation)
     fit = fitted(Superquadric.stack([foot, neck]))
     first, second, _ = fit.superquadric.size
-    assert first == pytest.approx(second, rel=course.ROUND_SIGMA)
     assert first == pytest.approx(0.04, rel=0.2)
     assert fit.superquadric.shape[1] > 0.95
+    assert first == pytest.approx(second, rel=course.ROUND_SIGMA)
+    if first != pytest.approx(second, rel=0.02):
+        pytest.xfail("roundness is a term of the cost: the widths differ by more than a criterion between bodies left")
 
 
 def test_what_is_seen_to_be_square_is_not_round() -> None:
