@@ -51,9 +51,9 @@ from sq_perception.imaging.regions import box, fills
 __all__ = ["FitOptions", "fit", "warm_up"]
 
 _FINE_NOISE = 0.1
-"""Noise, as a share of how far things stray from superquadrics, below which a superquadric is sought too: a thing's body
-may then leave more than the noise even of a true superquadric.  Under more noise it left 0.5 to 0.8 of it on true
-superquadrics, and 1.2 and more on things of benchmarks/household_things."""
+"""Noise, as a share of how far things stray from superquadrics, below which a superquadric is sought too: a thing's
+body may then leave more than the noise even of a true superquadric.  Under more noise it left 0.5 to 0.8 of it on
+true superquadrics, and 1.2 and more on things of benchmarks/household_things."""
 _MODEL_SHARE = 0.04
 """How far a small thing may stray, as a share of the side of a square whose area is that of its pixels: household
 things of 6 cm and more stray by :data:`~sq_perception.fitting.options.MODEL_ERROR`, and no more."""
