@@ -29,6 +29,7 @@ ARGUMENTS = {
     "camera_info": ("depth/camera_info", "topic of their camera_info"),
     "points": ("", "topic of point clouds in the optical frame, which are read instead of depth images"),
     "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
+    "detections": ("mask/detections", "topic of yolo_msgs/DetectionArray with masks, such as /yolo/detections"),
     "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
     "cameras": ("", "namespaces of several cameras: recover_cameras instead of recover_node"),
     "namespace": ("", "of the nodes; relative topics are in it too"),
@@ -88,6 +89,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         ("depth/camera_info", given["camera_info"]),
         ("depth/points", given["points"] or "depth/points"),
         ("mask/image", given["mask"]),
+        ("mask/detections", given["detections"]),
     ]
     single = {"namespace": first}
     nodes = [

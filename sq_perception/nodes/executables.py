@@ -28,7 +28,7 @@ _ABOUT = {
     "recover_node": """\
 Depth images in, superquadrics out.
 
-subscribes depth/image and depth/camera_info, or depth/points; mask/image if there are masks
+subscribes depth/image and depth/camera_info, or depth/points; mask/image or mask/detections for masks
 publishes  ~/superquadrics ~/markers ~/rendered_depth ~/support_plane /diagnostics
 services   ~/enable ~/trigger ~/recover, and those of a lifecycle node
 with the package sq_msgs also ~/superquadric_array ~/recover_array and the action ~/recover_images""",

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
+import cv2
 import numpy as np
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -29,6 +30,8 @@ from sq_perception.recordings import cloud_file, publication
 from sq_perception.recordings.cloud_frame import moved
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
+MaskMessage: TypeAlias = Any
+"""A label image, or a yolo_msgs/DetectionArray, which is imported only where it is installed."""
 _DIGITS = 3
 """Decimals of pixels to which a cloud's camera is rounded, so that noise does not change it between frames."""
 
@@ -74,9 +77,10 @@ class Frame:
         """Whether results are in the cube frame."""
         return not self.camera.is_pinhole
 
-    def with_mask(self, message: Image) -> Frame:
-        """Return the frame with a label image of its objects.  Raises ValueError for a wrong size or encoding."""
-        labels = labels_from_message(message)
+    def with_mask(self, message: MaskMessage) -> Frame:
+        """Return the frame with the masks of its objects.  Raises ValueError for a wrong size or encoding."""
+        is_image = isinstance(message, Image)
+        labels = labels_from_message(message) if is_image else draw_masks(message, self.calibration.size)
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
             raise ValueError(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
@@ -142,6 +146,37 @@ def decode(
     if kind == "range":
         depth = depth_units.z_from_range(depth, calibration.camera)
     return Frame(message.header, encoding, depth, calibration, notes=image.notes)
+
+
+def draw_masks(message: MaskMessage, size: tuple[int, int]) -> np.ndarray:
+    """Draw the masks of a yolo_msgs/DetectionArray as a label image, int32 (height, width).
+
+    Label k is the k-th detection; where two overlap, the one with the higher score is on top.
+
+    Raises
+    ------
+    ValueError
+        If a detection has no mask, or one of an image that is not ``size``, (width, height), pixels.
+    """
+    labels = np.zeros(size[::-1], np.int32)
+    numbered = enumerate(message.detections, start=1)
+    for number, detection in sorted(numbered, key=lambda one: float(one[1].score)):
+        mask = detection.mask
+        outline = np.array([(point.x, point.y) for point in mask.data], dtype=float).reshape(-1, 2)
+        if len(outline) < 3 or not np.isfinite(outline).all():
+            raise ValueError(
+                f"mask: expected a mask in every detection, got {len(outline)} finite points in number {number}: "
+                "use a model for segmentation, such as yolo11n-seg.pt"
+            )
+        if (mask.width, mask.height) != size:
+            raise ValueError(
+                f"mask: expected detections in an image of {size[0]} x {size[1]}, the depth image's size, got "
+                f"{mask.width} x {mask.height}: align the depth image to the colour image"
+            )
+        # Within the image: OpenCV's coordinates have 32 bits.
+        inside = np.rint(np.clip(outline, 0, np.subtract(size, 1))).astype(np.int32)
+        cv2.fillPoly(labels, [inside], number)
+    return labels
 
 
 def image_topic(node: Node, transport: str) -> str:

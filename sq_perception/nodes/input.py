@@ -24,11 +24,13 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes.frame import (
     DepthMessage,
     Frame,
+    MaskMessage,
     decode,
     image_topic,
     listen_to_latched_info,
     stamp_of,
 )
+from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
@@ -57,7 +59,7 @@ class Arrival:
     time: float
     deadline: float
     needs_mask: bool
-    mask: Image | None = None
+    mask: MaskMessage | None = None
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Input:
         """Stamp of the last image."""
         self._are_paired = False
         """Whether an image has had a camera_info of its own stamp."""
-        self._masks: OrderedDict[int, Image] = OrderedDict()
+        self._masks: OrderedDict[int, MaskMessage] = OrderedDict()
         self._is_closed = False
         # Subscriptions are served in this order: what an image needs is there before the image.
         self._info: Listener | None = None
@@ -105,6 +107,11 @@ class Input:
             self._info = Listener(node, CameraInfo, "depth/camera_info", self._on_info, statistics)
         self._latched: Subscription | None = None
         self._mask = Listener(node, Image, "mask/image", self._on_mask, statistics)
+        self._detections: Listener | None = optional(
+            node,
+            lambda kind: Listener(node, kind, "mask/detections", self._on_mask, statistics),
+            "yolo_msgs/msg/DetectionArray",
+        )
         kind = {RAW: Image, POINTS: PointCloud2}.get(transport, CompressedImage)
         self._image = Listener(node, kind, self.topic, self._on_image, statistics)
 
@@ -112,12 +119,21 @@ class Input:
         """Adapt to the publishers and to a latched camera_info; called each second."""
         for listener in self._listeners:
             listener.follow()
+        topic = self._node.resolve_topic_name("mask/detections")
+        if self._detections is None and self._node.count_publishers(topic) > 0:
+            text = f"{topic} is not read: yolo_msgs is not installed, or its workspace is not sourced"
+            self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE)
         if self._info is not None and self._latched is None and not self._is_closed:
             self._latched = listen_to_latched_info(self._node, self._info.topic, self._on_info)
 
     @property
     def _listeners(self) -> tuple[Listener, ...]:
-        return tuple(one for one in (self._image, self._mask, self._info) if one is not None)
+        return tuple(one for one in (self._image, self._mask, self._detections, self._info) if one is not None)
+
+    @property
+    def _has_mask_publisher(self) -> bool:
+        topics = [one.topic for one in (self._mask, self._detections) if one is not None]
+        return any(self._node.count_publishers(topic) > 0 for topic in topics)
 
     @property
     def silence(self) -> float:
@@ -196,7 +212,7 @@ class Input:
             return frame  # whose pixels are those of no mask
         if use == "always" and arrival.mask is None and frame.labels is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
-            raise ValueError(f"mask: {expected}, none came on {self._mask.topic}")
+            raise ValueError(f"mask: {expected}, none came on {self._mask.topic} or mask/detections")
         if use == "auto" and arrival.needs_mask and arrival.mask is None:
             self._statistics.count(WITHOUT_MASK)
             self._node.get_logger().warning(
@@ -239,7 +255,7 @@ class Input:
         use, deadline = parameters.use_masks, now + parameters.patience
         has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
         needs_mask = not has_labels and (
-            use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic) > 0)
+            use == "always" or (use == "auto" and self._has_mask_publisher)
         )
         with self._changed:
             if self._is_closed:
@@ -267,8 +283,8 @@ class Input:
             self._are_paired |= stamp_of(message) == self._image_stamp
             self._promote(monotonic())
 
-    def _on_mask(self, message: Image) -> None:
-        """Store a label image for the depth image with its stamp; ignore one without a stamp."""
+    def _on_mask(self, message: MaskMessage) -> None:
+        """Store masks for the depth image with its stamp; ignore one without a stamp."""
         if stamp_of(message) == 0:
             return
         with self._changed:

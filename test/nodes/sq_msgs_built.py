@@ -112,6 +112,46 @@ def test_recover_node_publishes_and_answers_in_it(make_bench):
     images.destroy()
 
 
+def test_masks_of_detections_are_used(make_bench):
+    from yolo_msgs.msg import Detection, DetectionArray, Mask, Point2D
+
+    def detection(score: float, *corners: tuple[float, float]) -> Detection:
+        points = [Point2D(x=float(x), y=float(y)) for x, y in corners]
+        return Detection(score=score, mask=Mask(width=64, height=48, data=points))
+
+    bench = make_bench()
+    detections = bench.peer.create_publisher(DetectionArray, "mask/detections", 5)
+    bench.until(lambda: detections.get_subscription_count() and bench.node.count_publishers("/mask/detections"))
+    bench.send_info()
+    expected = np.zeros((48, 64), np.int32)
+    expected[10:31, 5:26] = 2
+    expected[20:41, 15:36] = 1
+    image = bench.depth()
+    first = detection(0.9, (15, 20), (35, 20), (35, 40), (15, 40))
+    second = detection(0.4, (5, 10), (25, 10), (25, 30), (5, 30))
+    detections.publish(DetectionArray(header=image.header, detections=[first, second]))
+    bench.answer(image)
+    np.testing.assert_array_equal(bench.recoverer.asked[-1][2], expected, "the surer one is on top")
+
+    image = bench.depth()
+    detections.publish(DetectionArray(header=image.header))
+    bench.answer(image)
+    assert not bench.recoverer.asked[-1][2].any(), "an image without detections has no objects"
+
+    outside = detection(1.0, (-1e30, -5), (1e30, -5), (1e30, 1e30), (-1e30, 1e30))
+    image = bench.depth()
+    detections.publish(DetectionArray(header=image.header, detections=[outside]))
+    bench.answer(image)
+    assert (bench.recoverer.asked[-1][2] == 1).all(), "cut at the image's border"
+
+    wide = Detection(mask=Mask(width=640, height=480, data=first.mask.data))
+    for wrong, words in ((Detection(), "use a model for segmentation"), (wide, "align the depth image")):
+        image = bench.depth()
+        detections.publish(DetectionArray(header=image.header, detections=[first, wrong]))
+        counts = bench.send(image)
+        assert words in counts.last_error
+
+
 def test_grasp_node_publishes_and_answers_in_it():
     bench = SpunNodes()
     node = GraspNode("grasp_node", context=bench.context)

@@ -1,5 +1,7 @@
 """The interface package sq_msgs: built with the rosidl generators, and what nodes and a peer do with it then.
 
+A stand-in for the package of yolo_ros is built beside it, for masks of detections.
+
 What is built is found only by processes that start with its folders in their environment: the tests that use it are in
 ``sq_msgs_built.py``, which is run by a pytest of its own.
 """
@@ -37,8 +39,9 @@ def test_the_interfaces_are_built_and_nodes_use_them(repository: Path, tmp_path:
     build, built = tmp_path / "build", tmp_path / "install"
     options = ["-DBUILD_TESTING=OFF", "-DCMAKE_BUILD_TYPE=Debug", f"-DCMAKE_INSTALL_PREFIX={built}"]
     options += [f"-DPython3_EXECUTABLE={sys.executable}", f"-DCMAKE_PROJECT_INCLUDE={HERE / 'wheels.cmake'}"]
-    run(["cmake", "-S", str(repository / "sq_msgs"), "-B", str(build), *options], environment)
-    run(["cmake", "--build", str(build), "--target", "install"], environment)
+    for source in (repository / "sq_msgs", HERE / "detector_interfaces"):
+        run(["cmake", "-S", str(source), "-B", str(build / source.name), *options], environment)
+        run(["cmake", "--build", str(build / source.name), "--target", "install"], environment)
 
     after = {
         "AMENT_PREFIX_PATH": os.pathsep.join([str(built), *prefixes]),
