@@ -58,7 +58,7 @@ def ros2_run_lookup(package: str, executable: str, prefixes: str) -> Path:
 
 def test_the_wheel_carries_everything(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    data = f"{PACKAGE}-0.2.0.data/data"
+    data = f"{PACKAGE}-0.3.0.data/data"
     expected = {
         f"{data}/share/ament_index/resource_index/packages/{PACKAGE}",
         f"{data}/share/{PACKAGE}/package.xml",
