@@ -442,17 +442,6 @@ def test_a_file_that_cannot_be_finished_is_kept_aside(tmp_path, scene, monkeypat
     assert not (tmp_path / "results.mcap").exists()
 
 
-def test_a_file_that_is_there_is_replaced_when_the_new_one_is_whole(tmp_path, scene):
-    out = tmp_path / "results.mcap"
-    out.write_bytes(b"old")
-    bag = ResultBag(out)
-    bag.add(*scene, None)
-    assert out.read_bytes() == b"old"
-    bag.close()
-    bag.close()
-    assert len(messages(out)[SUPERQUADRICS]) == 1
-
-
 def test_memory_does_not_grow_with_the_frames(tmp_path, scene, monkeypatch):
     """200 frames more of 80 kB each leave less than 100 kB: their lines in the index."""
     frame, recovery = scene
