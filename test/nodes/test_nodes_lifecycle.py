@@ -9,18 +9,17 @@ import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+import frame_node_bench
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from frame_node_bench import counts_of, every_frame_anew
+from frame_node_bench import CAMERA, ball, counts_of, info_of, stand_ins
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -32,46 +31,28 @@ from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_msgs_py.depth_image import depth_to_message, labels_to_message
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.fitting.fit import Fit, Status
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import engine, managed_node
+from sq_perception.nodes import managed_node
 from sq_perception.nodes.frame_node import FrameNode
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
-
-CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+from sq_perception.recovery.recoverer import FrameRecovery
 
 
-class Recoverer:
+class Recoverer(frame_node_bench.Recoverer):
     """Answers one ball of the size that its model's name says, in centimetres."""
 
-    has_weights = True
-
     def __init__(self, model: str) -> None:
-        self.model = model
-        self.error: Exception | None = None
-        self.asked = 0
-        self.at_work = 0
-        self.most_at_work = 0
+        super().__init__()
+        self.bodies = (ball(radius=0.01 * float(model or 1)),)
+        self.at_work = self.most_at_work = 0
         self.duration = 0.0
 
-    def warm_up(self, camera: Camera) -> None:
-        self.warm = camera
-
-    def recover(self, depth: np.ndarray, camera: Camera, labels: Any, options: Any) -> FrameRecovery:
-        self.asked += 1
+    def recover(self, *given: Any) -> FrameRecovery:
         self.at_work += 1
         self.most_at_work = max(self.most_at_work, self.at_work)
         time.sleep(self.duration)
         self.at_work -= 1
-        if self.error is not None:
-            raise self.error
-        size = 0.01 * float(self.model or 1)
-        body = Superquadric(np.full(3, size), np.ones(2), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 0, 1.0]))
-        one = Recovery(Fit(body, 0.001, Status.CONVERGED, ""), 0.9, 1, 100)
-        return FrameRecovery((one,), {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
+        return super().recover(*given)
 
 
 class Bench(SpunNodes):
@@ -83,9 +64,7 @@ class Bench(SpunNodes):
         self.fault: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
-        weights = SimpleNamespace(resolve=lambda model: Path(f"{id(self)} {model}"), check=self._check)
-        made = {"Recoverer": self._make, "StillScene": every_frame_anew}
-        self.stand_ins = patch.multiple(engine, checkpoint=weights, **made)
+        self.stand_ins = stand_ins(self._make, lambda model: Path(f"{id(self)} {model}"), self._check)
         self.stand_ins.start()
         self.events: list[str] = []
         self.reports: list[DiagnosticStatus] = []
@@ -93,17 +72,10 @@ class Bench(SpunNodes):
             TransitionEvent, "/recover_node/transition_event", lambda e: self.events.append(e.goal_state.label), 50
         )
         self.peer.create_subscription(DiagnosticArray, "/diagnostics", lambda m: self.reports.extend(m.status), 50)
-        self.answers: dict[str, list[PointCloud2]] = {}
-        self.images: dict[str, Any] = {}
-        self.infos: dict[str, Any] = {}
-        for space in namespaces:
-            self.answers[space] = []
-            at = f"/{space}" if space else ""
-            self.images[space] = self.peer.create_publisher(Image, f"{at}/depth/image", 5)
-            self.infos[space] = self.peer.create_publisher(CameraInfo, f"{at}/depth/camera_info", 5)
-            self.peer.create_subscription(
-                PointCloud2, f"{at}/recover_node/superquadrics", self.answers[space].append, 50
-            )
+        at = {space: f"/{space}" if space else "" for space in namespaces}
+        self.answers = {one: self.hear(PointCloud2, f"{at[one]}/recover_node/superquadrics", 50) for one in at}
+        self.images = {one: self.peer.create_publisher(Image, f"{at[one]}/depth/image", 5) for one in at}
+        self.infos = {one: self.peer.create_publisher(CameraInfo, f"{at[one]}/depth/camera_info", 5) for one in at}
         self.nodes = [FrameNode("recover_node", namespace=space or None, context=self.context) for space in namespaces]
         self.node = self.nodes[0]
         self.spin(self.nodes, executor)
@@ -145,8 +117,7 @@ class Bench(SpunNodes):
     def publish(self, space: str = "", value: float = 0.5) -> Header:
         self.stamps += 1
         header = Header(stamp=Time(sec=1000 + self.stamps), frame_id=f"{space}_camera")
-        known = Intrinsics(CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
-        self.infos[space].publish(intrinsics_to_message(known, header))
+        self.infos[space].publish(info_of(CAMERA, header))
         self.images[space].publish(depth_to_message(np.full((48, 64), value), header))
         return header
 
@@ -371,13 +342,7 @@ class TestSwap:
 class TestSeveralCameras:
     @pytest.mark.parametrize("executor", [SingleThreadedExecutor, MultiThreadedExecutor, EventsExecutor])
     def test_two_cameras_in_one_process_share_a_recoverer_and_do_not_mix(self, make_bench, executor):
-        if executor is EventsExecutor:
-
-            def made(context: Any) -> Any:
-                return EventsExecutor(context=context)
-        else:
-            made = executor
-        bench = make_bench(namespaces=("front", "wrist"), executor=made).active()
+        bench = make_bench(namespaces=("front", "wrist"), executor=lambda context: executor(context=context)).active()
         assert len(bench.made) == 1
         bench.made[0].duration = 0.02
         for _ in range(5):
@@ -445,8 +410,6 @@ class TestSeveralCameras:
         assert kept == {"front": "VOLATILE", "wrist": "TRANSIENT_LOCAL"}
 
 def test_masks_that_come_later_than_newer_images_are_waited_for(make_bench):
-    from sq_msgs_py.depth_image import labels_to_message
-
     bench = make_bench("-p", "use_masks:=always", "-p", "patience:=5.0").active()
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
     bench.until(masks.get_subscription_count)

@@ -48,12 +48,7 @@ def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Re
 
 
 def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
-    return Frame(
-        header,
-        "32FC1",
-        np.full((camera.height, camera.width), np.nan, np.float32),
-        Calibration(camera),
-    )
+    return Frame(header, "32FC1", np.full((camera.height, camera.width), np.nan, np.float32), Calibration(camera))
 
 
 def recovery(*bodies: Recovery) -> FrameRecovery:
@@ -139,6 +134,10 @@ def outputs(node: Node) -> OptionalOutputs:
     made = OptionalOutputs(node)
     made.follow(ALL)
     return made
+
+
+def beside(body: Superquadric, x: float) -> Superquadric:
+    return Superquadric(body.size, body.shape, body.translation + [x, 0, 0], body.rotation)
 
 
 def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
@@ -233,21 +232,16 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
         outputs.publish(publication.findings(identified, HEADER, is_cube=False), replace(ALL, **changes))
         return len(objects(scene)) if len(scene.sent) > count else 0
 
-    def box(**changes: Any) -> Superquadric:
-        columns = {"size": BOX.size, "shape": BOX.shape, "translation": BOX.translation, "rotation": BOX.rotation}
-        return Superquadric(**{**columns, **changes})
-
-    quivers = box(translation=BOX.translation + 2e-4, size=BOX.size + 2e-4, rotation=-BOX.rotation)
+    quivers = Superquadric(BOX.size + 2e-4, BOX.shape, BOX.translation + 2e-4, -BOX.rotation)
     assert [show(BOX, CAN), show(quivers, CAN), show(BOX, CAN)] == [2, 0, 0]
     for moved in (
-        box(translation=BOX.translation + [0, 0, 0.003]),
-        box(size=BOX.size + [0.003, 0, 0]),
-        box(shape=[0.9, 0.6]),
-        box(rotation=[0.1, 0.2, 0.4, 0.9]),
+        Superquadric(BOX.size, BOX.shape, BOX.translation + [0, 0, 0.003], BOX.rotation),
+        Superquadric(BOX.size + [0.003, 0, 0], BOX.shape, BOX.translation, BOX.rotation),
+        Superquadric(BOX.size, [0.9, 0.6], BOX.translation, BOX.rotation),
+        Superquadric(BOX.size, BOX.shape, BOX.translation, [0.1, 0.2, 0.4, 0.9]),
     ):
         assert [show(moved, CAN), show(moved, CAN), show(BOX, CAN)] == [1, 0, 1]
-    slow = [box(translation=BOX.translation + [0.0005 * k, 0, 0]) for k in range(21)]
-    assert sum(show(one, CAN) for one in slow) == 4, "steps of half a millimetre add up to 10 mm"
+    assert sum(show(beside(BOX, 0.0005 * k), CAN) for k in range(21)) == 4, "steps of half a millimetre add up to 10 mm"
     show(BOX, CAN)
     scene.listeners = 2
     assert [show(BOX, CAN), show(BOX, CAN)] == [2, 0]
@@ -305,9 +299,6 @@ def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node, outputs):
                 if thing.operation == soft("moveit_msgs").CollisionObject.ADD:
                     known[thing.id] = thing.pose.position.x
         scene.sent.clear()
-
-    def beside(body: Superquadric, x: float) -> Superquadric:
-        return Superquadric(body.size, body.shape, body.translation + [x, 0, 0], body.rotation)
 
     heard({1: BOX, 2: CAN, 3: BOX})
     take()
@@ -423,17 +414,6 @@ def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
         np.testing.assert_array_equal(there.array.size[k], here.array.size[k])
     np.testing.assert_array_equal(there.array.sigma_size, here.array.sigma_size)
     assert in_frame(here, CameraPoses(node), "") is here
-
-
-def test_markers_follow_the_frame(node, tf2):
-    here = found(1, 2)
-    there = in_frame(here, CameraPoses(node), "map")
-    turn, shift = FRAMES["map"]
-    one, other = (findings.markers() for findings in (here, there))
-    assert {marker.header.frame_id for marker in other.markers} == {"map"}
-    for k in range(4):
-        near, far = (np.array([[p.x, p.y, p.z] for p in array.markers[k].points]) for array in (one, other))
-        np.testing.assert_allclose(near @ quaternions.to_matrix(turn).T + shift, far, atol=1e-6)
 
 
 def test_markers_that_are_gone_are_deleted_for_a_while_and_all_of_them_at_once(monkeypatch):

@@ -13,14 +13,14 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from running_nodes import BODIES, CAMERA, PATIENCE, Peer, arguments, environment, nanoseconds, until
+from running_nodes import BODIES, PATIENCE, Peer, arguments, environment, nanoseconds, until
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from started_nodes import Child
 from std_srvs.srv import SetBool
 
 from sq_msgs_py.depth_image import depth_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.geometry.metrics import thesis_iou, volume_iou
+from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.publication import superquadrics
 
@@ -103,13 +103,6 @@ def test_empty_tiny_and_swapped_frames_are_answered(recover_node, peer):
     np.testing.assert_allclose(second.size, first.size, rtol=1e-4)
 
 
-def test_frames_change_their_size_from_one_moment_to_the_next(recover_node, peer):
-    for camera in (CAMERA, Camera(96, 72, 84.0, 84.0, 47.5, 35.5), Camera(200, 60, 140.0, 140.0, 99.5, 29.5), CAMERA):
-        found = answer(peer, recover_node, *peer.frame(BODY, camera))
-        assert len(found) == 1
-    assert volume_iou(superquadrics(found), BODY)[0] > 0.8
-
-
 def test_parameters_change_from_another_process(recover_node, peer):
     node, alive = "/recover_node", (recover_node,)
     before = answer(peer, recover_node, *peer.frame(BODY))
@@ -158,7 +151,8 @@ def test_publishers_come_and_go(recover_node, peer, start):
         assert got.header.frame_id == "camera_depth_optical_frame"
         assert len(from_message(expected)) == int(parameters[0][-1])
         stopped(source, number=number)
-    assert len(answer(peer, recover_node, *peer.frame(BODY))) == 1
+    found = answer(peer, recover_node, *peer.frame(BODY))
+    assert volume_iou(superquadrics(found), BODY)[0] > 0.8
 
 
 def test_a_deaf_subscription_names_the_publisher(peer, start):
@@ -171,42 +165,6 @@ def test_a_deaf_subscription_names_the_publisher(peer, start):
     peer.node.destroy_publisher(deaf)
     assert len(answer(peer, process, *peer.frame(BODY))) == 1
     stopped(process, number=signal.SIGTERM)
-
-
-def test_thesis_frames_are_recovered_in_the_cube_frame(peer, start):
-    source = start("synthetic_depth_node", "scene:=thesis", "rate:=5.0", "hold:=1000", "seed:=3")
-    process = start("fitter_node", "projection:=orthographic", "s:=20")
-    heard: dict[str, list[PointCloud2]] = {"/synthetic_depth_node/truth": [], "/fitter_node/superquadrics": []}
-    for topic, messages in heard.items():
-        peer.listen(PointCloud2, topic, messages.append)
-
-    def in_cube(messages: list[PointCloud2]) -> PointCloud2 | None:
-        return next((one for one in messages if one.header.frame_id == "unit_cube"), None)
-
-    known, found = (
-        superquadrics(from_message(until(lambda one=one: in_cube(one), (source, process)))) for one in heard.values()
-    )
-    assert thesis_iou(found, known)[0] > 0.3
-    assert np.linalg.norm(found.translation - known.translation) < 0.2
-    for one in (source, process):
-        stopped(one, times=2)
-
-
-def test_recordings_are_replayed_with_their_masks(peer, start, shared_data):
-    frame = shared_data / "frames" / "felix_0.npz"
-    with np.load(frame) as archive:
-        shape, count = archive["depth"].shape, len(np.unique(archive["labels"])) - 1
-    infos: list[CameraInfo] = []
-    peer.listen(CameraInfo, "depth/camera_info", infos.append)
-    process = start("recover_node", "method:=symmetry", "use_masks:=always")
-    source = start("synthetic_depth_node", "scene:=replay", f"path:={frame}", "rate:=2.0", "loop:=false", "hold:=1000")
-    heard = peer.answers("/recover_node")
-    seen = len(heard)
-    message = until(lambda: next((one.message for one in heard[seen:] if one.message.width), None), (process,))
-    assert len(from_message(message)) == count
-    until(lambda: any((one.height, one.width) == shape for one in infos), (process,))
-    for one in (source, process):
-        stopped(one)
 
 
 def test_a_corrupt_model_ends_the_start_with_a_reason(start, tmp_path):

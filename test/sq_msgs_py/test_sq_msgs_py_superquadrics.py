@@ -44,33 +44,17 @@ def test_the_published_layout_does_not_change() -> None:
 
 def test_one_body_reads_by_hand() -> None:
     body = SuperquadricArray(
-        size=np.array([[1.0, 2.0, 3.0]]),
-        shape=np.array([[0.25, 0.5]]),
-        translation=np.array([[4.0, 5.0, 6.0]]),
-        rotation=np.array([[0.0, 0.0, 0.0, 1.0]]),
-        score=np.array([0.75]),
-        residual=np.array([0.125]),
-        sigma_size=np.array([[7.0, 8.0, 9.0]]),
-        id=np.array([4_000_000_000]),
-        status=np.array([1]),
-        label=np.array([12]),
-        seen=np.array([3]),
-        fused=np.array([1]),
-        reason=np.array([Reason.OPEN_Z | Reason.HULL]),
-        sigma_shape=np.array([[0.25, 0.5]]),
-        sigma_centre=np.array([[1.5, 2.5, 3.5]]),
-        sigma_turn=np.array([[0.5, 0.25, 0.125]]),
-        taper=np.array([[0.5, -0.25]]),
-        objectness=np.array([0.875]),
+        size=np.array([[1.0, 2.0, 3.0]]), shape=np.array([[0.25, 0.5]]), translation=np.array([[4.0, 5.0, 6.0]]),
+        rotation=np.array([[0.0, 0.0, 0.0, 1.0]]), score=np.array([0.75]), residual=np.array([0.125]),
+        sigma_size=np.array([[7.0, 8.0, 9.0]]), id=np.array([4_000_000_000]), status=np.array([1]),
+        label=np.array([12]), seen=np.array([3]), fused=np.array([1]), reason=np.array([Reason.OPEN_Z | Reason.HULL]),
+        sigma_shape=np.array([[0.25, 0.5]]), sigma_centre=np.array([[1.5, 2.5, 3.5]]),
+        sigma_turn=np.array([[0.5, 0.25, 0.125]]), taper=np.array([[0.5, -0.25]]), objectness=np.array([0.875]),
         part=np.array([2]),
     )
     message = superquadrics.to_message(body, HEADER)
     assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
-        HEADER,
-        1,
-        1,
-        140,
-        140,
+        HEADER, 1, 1, 140, 140,
     )
     numbers = struct.unpack("<17f6I11fI", message.data.tobytes())
     before = (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
