@@ -400,17 +400,6 @@ def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(ma
     assert "2 x 2 pixels" in bench.send(one).last_error
 
 
-def test_a_publisher_that_cannot_be_heard_is_named(make_bench):
-    bench = make_bench("-p", "qos_overrides./depth/image.subscription.reliability:=reliable")
-    deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-    bench.peer.create_publisher(Image, "depth/image", deaf)
-    bench.until(lambda: bench.node.count_publishers("/depth/image") == 2)
-    words = bench.node._input.heard
-    assert words.startswith("2 publishers: ")
-    assert words.count("INCOMPATIBLE") == 1
-    assert "best effort" in words
-
-
 def test_a_latched_cloud_reaches_those_who_come_later(make_bench):
     bench = make_bench("-p", "qos_overrides./recover_node/superquadrics.publisher.durability:=transient_local")
     bench.send_info()

@@ -89,7 +89,6 @@ def test_distortion_comes_along(tmp_path):
         ('{"fx": 0.9, "fy": 0.9, "cx": 0.5, "cy": 0.5}', "divided by the size of the image"),
         ('{"a": {"fx": 60, "fy": 61, "cx": 1, "cy": 1}, "b": {"fx": 70, "fy": 71, "cx": 1, "cy": 1}}', "got 2: a, b"),
         ("1 FOV 64 48 1 2 3 4 5", "expected a model of SIMPLE_PINHOLE"),
-
     ],
 )
 def test_what_is_missing_is_named(tmp_path, text, said):
