@@ -383,38 +383,29 @@ def test_csv_and_a_page_are_written_beside_each_other(tmp_path, capsys):
     assert "frames.push" in page.read_text()
 
 
-def test_an_interruption_leaves_whole_files(tmp_path, monkeypatch, capsys):
-    """Ctrl-C while the second frame's mesh is being written: the first frame's files are there, and nothing half."""
-    for name in ("a", "b", "c"):
-        save_npz(tmp_path / f"{name}.npz")
+@pytest.mark.parametrize(
+    ("how", "code", "words"),
+    [(KeyboardInterrupt(), 130, "interrupted"), (OSError(28, "No space left on device"), 1, "No space left")],
+    ids=["Ctrl-C", "full disk"],
+)
+def test_an_interruption_leaves_whole_files(tmp_path, monkeypatch, capsys, how, code, words):
+    """While the second frame's mesh is being written: the first frame's files are there, and nothing half."""
+    names = [save_npz(tmp_path / f"{name}.npz") for name in ("a", "b", "c")]
     export = mesh.export
 
     def interrupted(bodies, path, **options):
         export(bodies, path, **options)
         if "b.glb" in path.name:
-            raise KeyboardInterrupt
+            raise how
 
     monkeypatch.setattr(mesh, "export", interrupted)
-    names = [tmp_path / f"{name}.npz" for name in ("a", "b", "c")]
-    frames = recover(tmp_path, *names, "--meshes", tmp_path / "meshes", code=130)
+    frames = recover(tmp_path, *names, "--meshes", tmp_path / "meshes", code=code)
     assert [frame["file"] for frame in frames] == [str(name) for name in names[:2]]
     assert [path.name for path in (tmp_path / "meshes").iterdir()] == ["a.glb"]
     assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
     errors = capsys.readouterr().err
-    assert "interrupted" in errors
+    assert words in errors
     assert "2 frames, 4 objects (0 failed), median" in errors
-
-
-def test_a_full_disk_ends_the_run_with_what_is_done(tmp_path, monkeypatch, capsys):
-    def full(bodies, path, **options):
-        path.write_bytes(b"half a mesh")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(mesh, "export", full)
-    names = [save_npz(tmp_path / f"{name}.npz") for name in ("a", "b")]
-    assert len(recover(tmp_path, *names, "--meshes", tmp_path / "meshes", code=1)) == 1
-    assert not list((tmp_path / "meshes").iterdir())
-    assert "No space left" in capsys.readouterr().err
 
 
 def save_grown(path, share):
