@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,8 +28,8 @@ CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 FRAME_ID = "some_camera_optical_frame"
 
 
-def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
-    body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
+def ball(label: int = 1, status: Status = Status.CONVERGED, radius: float = 0.1) -> Recovery:
+    body = Superquadric(np.full(3, radius), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
     return Recovery(Fit(body, 0.001, status, ""), 0.9, label, 100)
 
 
@@ -39,6 +40,11 @@ def counts_of(node: FrameNode) -> Any:
         counts = {what: one._counts[what] for what in ("received", "answered", "dropped", "refused")}
         in_work = 2 * counts["received"] - sum(counts.values())
         return SimpleNamespace(**counts, in_work=in_work, lost=dict(one._lost), last_error=one._last_error)
+
+
+def info_of(camera: Camera, header: Header) -> CameraInfo:
+    known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+    return intrinsics_to_message(known, header)
 
 
 class Recoverer:
@@ -67,9 +73,13 @@ class Recoverer:
         return FrameRecovery(self.bodies, {"total": 1.0}, labels, self.plane, self.message, doubt=self.doubt)
 
 
-def every_frame_anew(recoverer: Any, last: Any) -> Any:
-    """A stand-in for a StillScene that repeats nothing."""
-    return SimpleNamespace(recover=recoverer.recover, last=None)
+def stand_ins(
+    make: Callable[..., Recoverer], resolve: Callable[[Any], Path], check: Callable[[Any], None] = lambda _: None
+) -> Any:
+    """A patch by which nodes make these recoverers, which repeat no frame, of weights that nobody reads."""
+    scenes = lambda recoverer, last: SimpleNamespace(recover=recoverer.recover, last=None)  # noqa: E731
+    weights = SimpleNamespace(resolve=resolve, check=check)
+    return patch.multiple(engine, checkpoint=weights, Recoverer=make, StillScene=scenes)
 
 
 class Bench(SpunNodes):
@@ -78,9 +88,7 @@ class Bench(SpunNodes):
     def __init__(self, *arguments: str) -> None:
         super().__init__(*arguments)
         self.recoverer = Recoverer()
-        weights = SimpleNamespace(resolve=lambda _: Path(f"weights of {id(self)}"), check=lambda _: None)
-        made = {"Recoverer": lambda *_, **__: self.recoverer, "StillScene": every_frame_anew}
-        self.stand_ins = patch.multiple(engine, checkpoint=weights, **made)
+        self.stand_ins = stand_ins(lambda *_, **__: self.recoverer, lambda _: Path(f"weights of {id(self)}"))
         self.stand_ins.start()
         self.node = FrameNode("recover_node", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
@@ -115,8 +123,7 @@ class Bench(SpunNodes):
         self.put_info(self.info(camera))
 
     def info(self, camera: Camera = CAMERA) -> CameraInfo:
-        known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        return intrinsics_to_message(known, self.header())
+        return info_of(camera, self.header())
 
     def put_info(self, message: CameraInfo) -> None:
         self.until(self.infos.get_subscription_count)

@@ -304,8 +304,6 @@ def usage(pid: int) -> Usage:
     maps = (place / "maps").read_text().splitlines()
     mapped = {line.rsplit("/", 1)[1] for line in maps if "/fastrtps_" in line}
     return Usage(
-        rss=int(status["VmRSS"][0]) / 1024,
-        threads=int(status["Threads"][0]),
-        files=len(os.listdir(place / "fd")),
+        rss=int(status["VmRSS"][0]) / 1024, threads=int(status["Threads"][0]), files=len(os.listdir(place / "fd")),
         segments=len(mapped),
     )

@@ -31,11 +31,7 @@ _TCP, _UDP = 6, 17
 _OUTGOING = 4
 """Type of a packet as its sender sees it; the loopback device shows each one to its receiver too."""
 _PROBE = "192.0.2.255"
-_SETUP = (
-    "ip link set lo up",
-    "ip route add local default dev lo",
-    "ip -6 route add local default dev lo",
-)
+_SETUP = ("ip link set lo up", "ip route add local default dev lo", "ip -6 route add local default dev lo")
 
 
 @dataclass(frozen=True)

@@ -97,13 +97,7 @@ PACKAGES = {
     "tf2_msgs": (TFMessage,),
     "vision_msgs": (ObjectHypothesis, ObjectHypothesisWithPose, BoundingBox3D, Detection3D, Detection3DArray),
     "moveit_msgs": (
-        CollisionObject,
-        RobotState,
-        PlanningSceneWorld,
-        PlanningScene,
-        GripperTranslation,
-        Grasp,
-        MoveItErrorCodes,
+        CollisionObject, RobotState, PlanningSceneWorld, PlanningScene, GripperTranslation, Grasp, MoveItErrorCodes,
     ),
 }
 

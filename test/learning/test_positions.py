@@ -12,12 +12,13 @@ from sq_perception.simulation import view_rendering
 
 
 def random(count: int, rng: np.random.Generator) -> Superquadric:
-    return Superquadric(
-        rng.uniform(0.1, 0.3, (count, 3)),
-        rng.uniform(0.1, 1.0, (count, 2)),
-        rng.uniform(0.4, 0.6, (count, 3)),
-        quaternions.random(count, rng),
-    )
+    size, shape = rng.uniform(0.1, 0.3, (count, 3)), rng.uniform(0.1, 1.0, (count, 2))
+    return Superquadric(size, shape, rng.uniform(0.4, 0.6, (count, 3)), quaternions.random(count, rng))
+
+
+def changed(bodies: Superquadric, growth: float, shift: float, turn: np.ndarray) -> Superquadric:
+    rotation = quaternions.multiply(bodies.rotation, turn)
+    return Superquadric(bodies.size * growth, bodies.shape, bodies.translation + shift, rotation)
 
 
 def answers(*each: Superquadric) -> Superquadric:
@@ -46,13 +47,7 @@ def test_the_mean_of_forms_of_a_body_is_the_body() -> None:
 def test_opposite_errors_cancel() -> None:
     bodies = random(20, np.random.default_rng(2))
     turn = np.array([np.sin(0.05), 0.0, 0.0, np.cos(0.05)])
-    back = turn * [-1, -1, -1, 1]
-    larger = Superquadric(
-        bodies.size * 1.1, bodies.shape, bodies.translation + 0.02, quaternions.multiply(bodies.rotation, turn)
-    )
-    smaller = Superquadric(
-        bodies.size / 1.1, bodies.shape, bodies.translation - 0.02, quaternions.multiply(bodies.rotation, back)
-    )
+    larger, smaller = changed(bodies, 1.1, 0.02, turn), changed(bodies, 1 / 1.1, -0.02, turn * [-1, -1, -1, 1])
     mean = positions.mean(answers(larger, smaller))
     sign = np.sign((mean.rotation * bodies.rotation).sum(axis=1, keepdims=True))
     np.testing.assert_allclose(mean.size, bodies.size)
@@ -62,10 +57,7 @@ def test_opposite_errors_cancel() -> None:
 
 def test_different_answers_are_not_mixed_and_the_one_that_has_most_counts() -> None:
     bodies = random(20, np.random.default_rng(3))
-    turn = np.array([np.sin(0.35), 0, 0, np.cos(0.35)])
-    aside = Superquadric(
-        bodies.size * 1.5, bodies.shape, bodies.translation, quaternions.multiply(bodies.rotation, turn)
-    )
+    aside = changed(bodies, 1.5, 0.0, np.array([np.sin(0.35), 0, 0, np.cos(0.35)]))
     for shown, expected in (((bodies, aside), bodies), ((aside, bodies, bodies), bodies), ((aside, bodies), aside)):
         found = positions.mean(answers(*shown))
         np.testing.assert_allclose(found.size, expected.size)

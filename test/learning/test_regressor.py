@@ -35,12 +35,8 @@ def torchvision_state(rng: np.random.Generator) -> dict[str, torch.Tensor]:
         state[f"{name}.weight"] = torch.tensor(spread * rng.standard_normal((out, into, side, side))).float()
 
     def norm(name: str, channels: int) -> None:
-        for what, low, high in (
-            ("weight", 0.5, 1),
-            ("bias", -0.1, 0.1),
-            ("running_mean", -1, 1),
-            ("running_var", 1, 2),
-        ):
+        bounds = {"weight": (0.5, 1), "bias": (-0.1, 0.1), "running_mean": (-1, 1), "running_var": (1, 2)}
+        for what, (low, high) in bounds.items():
             state[f"{name}.{what}"] = torch.tensor(rng.uniform(low, high, channels)).float()
         state[f"{name}.num_batches_tracked"] = torch.tensor(7)
 
@@ -92,10 +88,8 @@ class TestConfig:
             model = Regressor(config)
         count = sum(parameter.numel() for parameter in model.features.parameters())
         assert count == 11_689_512 - 513 * 1000 - 2 * 64 * 49
-        assert [tuple(layer.weight.shape) for layer in model.mixer if hasattr(layer, "weight")] == [
-            (256, 512),
-            (256, 256),
-        ]
+        shapes = [tuple(layer.weight.shape) for layer in model.mixer if hasattr(layer, "weight")]
+        assert shapes == [(256, 512), (256, 256)]
 
     @pytest.mark.parametrize(
         ("field", "value"),

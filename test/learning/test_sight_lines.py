@@ -22,9 +22,22 @@ def views(count: int, seed: int, pixels: int = 32) -> tuple[torch.Tensor, Superq
     return torch.tensor(images, dtype=torch.float64), Superquadric.from_flat(torch.tensor(bodies.to_flat()))
 
 
-def axis_parallel(shape: float) -> torch.Tensor:
+@pytest.mark.parametrize("shape", [0.1, 1.0])
+@pytest.mark.parametrize("sharpness", [None, 5.0, 300.0], ids=["free space", "soft", "sharp"])
+def test_gradients_are_finite_on_axes(shape: float, sharpness: float | None) -> None:
     """A body whose axes are those of the cube, seen through its middle and along its faces: every term is zero once."""
-    return torch.tensor([[0.2, 0.3, 0.4, shape, shape, 0.5, 0.5, 0.5, *IDENTITY]], dtype=torch.float64)
+    flat = torch.tensor([[0.2, 0.3, 0.4, shape, shape, 0.5, 0.5, 0.5, *IDENTITY]], dtype=torch.float64).requires_grad_()
+    steps = torch.linspace(0, 1, 11, dtype=torch.float64)
+    lines, body = torch.cartesian_prod(steps, steps), Superquadric.from_flat(flat)
+    if sharpness is None:
+        image = sight_lines.free_space_excess(body, lines, lines.new_zeros(1, 121))
+    else:
+        image = sight_lines.soft_depth(body, lines, sharpness, 2 * sharpness)
+    image.sum().backward()
+    assert torch.isfinite(flat.grad).all()
+    assert torch.isfinite(image).all()
+    assert (image >= 0).all()
+    assert (image <= 1).all()
 
 
 class TestLines:
@@ -86,15 +99,6 @@ class TestFreeSpace:
             (bodies.to_flat() + 0.05).requires_grad_(),
         )
 
-    @pytest.mark.parametrize("shape", [0.1, 1.0])
-    def test_gradients_are_finite_on_axes(self, shape: float) -> None:
-        flat = axis_parallel(shape).requires_grad_()
-        steps = torch.linspace(0, 1, 11, dtype=torch.float64)
-        lines = torch.cartesian_prod(steps, steps)
-        sight_lines.free_space_excess(Superquadric.from_flat(flat), lines, lines.new_zeros(1, 121)).sum().backward()
-        assert torch.isfinite(flat.grad).all()
-
-
 class TestSoftDepth:
     @pytest.mark.parametrize(("s", "density"), [(10.0, 20.0), (40.0, 100.0), (117.3, 308.5)])
     def test_is_the_limit_of_fine_voxels_with_its_gradient(self, s: float, density: float) -> None:
@@ -134,18 +138,6 @@ class TestSoftDepth:
     def test_nothing_seen_is_zero(self) -> None:
         away = torch.tensor([[0.05, 0.95]], dtype=torch.float64)
         assert sight_lines.soft_depth(SPHERE, away, 100.0, 200.0).item() == pytest.approx(0, abs=1e-9)
-
-    @pytest.mark.parametrize("shape", [0.1, 1.0])
-    @pytest.mark.parametrize("s", [5.0, 300.0])
-    def test_gradients_are_finite_on_axes(self, shape: float, s: float) -> None:
-        flat = axis_parallel(shape).requires_grad_()
-        steps = torch.linspace(0, 1, 11, dtype=torch.float64)
-        image = sight_lines.soft_depth(Superquadric.from_flat(flat), torch.cartesian_prod(steps, steps), s, 2 * s)
-        image.sum().backward()
-        assert torch.isfinite(image).all()
-        assert (image >= 0).all()
-        assert (image <= 1).all()
-        assert torch.isfinite(flat.grad).all()
 
     @pytest.mark.parametrize(("s", "density", "cells"), [(0.0, 1.0, 8), (1.0, -1.0, 8), (1.0, 1.0, 0)])
     def test_refuses_nonsense(self, s: float, density: float, cells: int) -> None:

@@ -40,19 +40,8 @@ def log_of(folder: Path) -> list[dict[str, Any]]:
 
 def endless(folder: Path, validation: int) -> list[str]:
     """The command of a run that somebody has to stop."""
-    command = [
-        sys.executable,
-        "-m",
-        "sq_perception",
-        "train",
-        "--output",
-        str(folder),
-        "--pixels",
-        "16",
-        "--batch",
-        "4",
-    ]
-    return [*command, "--points", "16", "--validation", str(validation), "--threads", "1", "--steps", "100000"]
+    options = f"--pixels 16 --batch 4 --points 16 --validation {validation} --threads 1 --steps 100000"
+    return [sys.executable, "-m", "sq_perception", "train", "--output", str(folder), *options.split()]
 
 
 class TestConfig:
@@ -251,14 +240,22 @@ class TestInterruptions:
             train.train(replace(RUN, steps=4, loss="render"), tmp_path, SMALL)
         assert (tmp_path / "state.safetensors").read_bytes() == before
 
-    @pytest.mark.parametrize("content", [b"not a state", None])
-    def test_foreign_state_is_refused(self, content: bytes | None, tmp_path: Path) -> None:
+    @pytest.mark.parametrize(
+        ("content", "header", "words"),
+        [
+            (b"not a state", None, "not the state of such a run"),
+            (None, None, "not the state of such a run"),
+            *((None, {"training": text}, "does not tell what run it is of") for text in ("{", "[1]", "null")),
+        ],
+    )
+    def test_foreign_state_is_refused(
+        self, content: bytes | None, header: dict[str, str] | None, words: str, tmp_path: Path
+    ) -> None:
         path = tmp_path / "state.safetensors"
-        if content is None:
-            save_file({"step": torch.tensor(1)}, str(path))
-        else:
+        save_file({"step": torch.tensor(1)}, str(path), header)
+        if content is not None:
             path.write_bytes(content)
-        with pytest.raises(checkpoint.CheckpointError, match="not the state of such a run"):
+        with pytest.raises(checkpoint.CheckpointError, match=words):
             train.train(RUN, tmp_path, SMALL)
 
     def test_moments_of_other_weights_are_refused(self, tmp_path: Path) -> None:
@@ -267,13 +264,6 @@ class TestInterruptions:
         save_file({**load_file(str(path)), "optimizer.0.exp_avg": torch.zeros(3)}, str(path))
         with pytest.raises(checkpoint.CheckpointError, match=r"not the state of such a run: optimizer\.0\.exp_avg"):
             train.train(replace(RUN, steps=2), tmp_path, SMALL)
-
-    @pytest.mark.parametrize("settings", ["{", "[1]", "null"])
-    def test_settings_that_are_none_are_refused(self, settings: str, tmp_path: Path) -> None:
-        save_file({"step": torch.tensor(1)}, str(tmp_path / "state.safetensors"), {"training": settings})
-        with pytest.raises(checkpoint.CheckpointError, match="does not tell what run it is of"):
-            train.train(RUN, tmp_path, SMALL)
-
 
 class TestContinuation:
     def test_average_follows_and_is_what_is_saved(self, tmp_path: Path) -> None:

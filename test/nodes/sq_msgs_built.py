@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from random_bodies import random_bodies
 from rclpy.action import ActionClient
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
@@ -30,23 +31,7 @@ def compiled():
 
 
 def bodies(count: int = 2) -> superquadrics.SuperquadricArray:
-    rng = np.random.default_rng(3)
-    rotation = rng.normal(size=(count, 4))
-    return superquadrics.SuperquadricArray(
-        size=rng.uniform(0.02, 0.05, (count, 3)),
-        shape=rng.uniform(0.1, 1.0, (count, 2)),
-        translation=rng.uniform(0.4, 0.6, (count, 3)),
-        rotation=rotation / np.linalg.norm(rotation, axis=1, keepdims=True),
-        score=rng.random(count),
-        residual=rng.random(count),
-        sigma_size=rng.random((count, 3)),
-        id=np.arange(count) + 7,
-        status=np.arange(count) % 3,
-        reason=np.full(count, 5),
-        fused=np.arange(count) % 2,
-        taper=rng.uniform(-0.5, 0.5, (count, 2)),
-        objectness=rng.random(count),
-    )
+    return random_bodies(count, np.random.default_rng(3))
 
 
 def same(found: Superquadric, array: superquadrics.SuperquadricArray, k: int) -> None:
@@ -68,7 +53,7 @@ def test_a_message_holds_every_number_of_the_cloud_the_covariances_and_parts():
     for k in range(2):
         same(message.superquadrics[k], array, k)
         np.testing.assert_array_equal(message.superquadrics[k].pose.covariance, covariances[k].ravel())
-        assert np.isnan(message.superquadrics[k].sigma_exponents).all(), "not known"
+        np.testing.assert_array_equal(message.superquadrics[k].sigma_exponents, array.sigma_shape[k])
     for k, part in enumerate(message.parts):
         same(part, replace(array, part=np.array([1, 2])), k)
         assert np.isnan(part.pose.covariance).all()
@@ -162,7 +147,8 @@ def test_grasp_node_publishes_and_answers_in_it():
         bench.until(lambda: node.is_active and clouds.get_subscription_count())
         upright = superquadrics.SuperquadricArray(
             **{
-                **{name: getattr(bodies(1), name) for name in ("score", "residual", "id", "status", "objectness")},
+                **{name: getattr(bodies(1), name) for name in ("score", "residual", "status", "objectness")},
+                "id": [7],
                 "size": [[0.02, 0.02, 0.05]],
                 "shape": [[0.2, 1.0]],
                 "translation": [[0.0, 0.0, 0.5]],

@@ -83,15 +83,6 @@ def test_a_method_that_needs_a_network_whose_file_is_gone_is_refused(engine, mod
     assert engine.description == "method symmetry, no network"
 
 
-@pytest.mark.parametrize(("name", "value"), [("threads", 2), ("method", "auto")])
-def test_only_a_set_of_the_model_reads_its_file_again(engine, model, name, value):
-    parameters = RecoverParameters(model=str(model), threads=1, method="network")
-    engine.build(parameters)
-    model.write_bytes(b"another one")
-    set_to(engine, parameters, **{name: value})
-    assert engine.fault == ""
-
-
 def test_fitter_node_asks_for_the_classic_method_and_nothing_else():
     one, other = FitterParameters().recovery_options(), RecoverParameters().recovery_options()
     assert one == replace(other, method="classic")

@@ -129,6 +129,7 @@ def test_grasps_come_best_first_with_the_header_of_the_bodies(bench):
 
 
 def test_the_node_says_what_it_listens_to_and_diagnostics_what_it_did(bench):
+    """A cloud of something else is refused, and the next one answered."""
     bench.says("ready, listening to /superquadrics")
     bench.answer(to_message(bodies(), HEADER))
     status, values = bench.report(lambda status, values: values["answered"] == "1")
@@ -140,6 +141,8 @@ def test_the_node_says_what_it_listens_to_and_diagnostics_what_it_did(bench):
     status, values = bench.report(lambda status, values: values["refused"] == "1")
     assert values["last error"]
     assert (values["received"], values["in work"]) == ("2", "0")
+    assert len(bench.answer(to_message(bodies(), Header()))["grasps"].poses) > 0
+    assert len(bench.answer(to_message(SuperquadricArray.empty(), Header()))["grasps"].poses) == 0
 
 
 def test_silence_is_reported_with_who_publishes():
@@ -227,22 +230,6 @@ def test_bodies_are_grasped_however_far_away_the_origin_of_a_map_is(bench):
     assert set(messages.from_message(heard["grasp_details"]).id) == {BOX, CAN}
 
 
-def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):
-    bench.cloud.publish(PointCloud2(width=3, height=1))
-    assert len(bench.answer(to_message(bodies(), Header()))["grasps"].poses) > 0
-    assert len(bench.answer(to_message(SuperquadricArray.empty(), Header()))["grasps"].poses) == 0
-
-
-def test_markers_go_with_the_node_that_shows_them(bench):
-    bench.answer(to_message(bodies(), HEADER))
-    bench.heard.clear()
-    assert bench.node._change("deactivate")
-    bench.until(lambda: "markers" in bench.heard)
-    gone = bench.heard["markers"].markers
-    assert {(marker.action, marker.id) for marker in gone} == {(Marker.DELETE, BOX), (Marker.DELETE, CAN)}
-    assert {marker.ns for marker in gone} == {"grasps/surface", "grasps/outline"}
-
-
 def test_a_cloud_that_is_planned_while_the_node_is_deactivated_is_dropped(bench, monkeypatch):
     """Deactivated between the plan and its publication: no refusal, no grasps, and the next activation answers."""
     planned, said = grasp_node.plan, []
@@ -275,10 +262,17 @@ def test_a_pause_leaves_no_subscription_and_no_publisher_behind(bench):
         assert bench.node._change("activate")
 
 
-def test_what_was_there_before_a_pause_is_not_planned_for_after_it(bench):
+def test_what_was_there_before_a_pause_is_neither_shown_nor_planned_for_after_it(bench):
     bench.answer(to_message(bodies(), HEADER))
     assert bench.call(Trigger, "/grasp_node/plan").success
+    bench.heard.clear()
     assert bench.node._change("deactivate")
+    bench.until(lambda: "markers" in bench.heard)
+    gone = bench.heard["markers"].markers
+    kinds = ("grasps/surface", "grasps/outline")
+    assert {(marker.action, marker.id, marker.ns) for marker in gone} == {
+        (Marker.DELETE, body, kind) for body in (BOX, CAN) for kind in kinds
+    }
     assert bench.node._change("activate")
     answer = bench.call(Trigger, "/grasp_node/plan")
     assert (answer.success, answer.message) == (False, "no superquadrics have come yet")

@@ -19,12 +19,7 @@ from running_nodes import Peer, arguments, environment, until
 from started_nodes import Children
 from std_msgs.msg import Header
 
-from sq_msgs_py.depth_image import (
-    DEPTH_ENCODINGS,
-    ImageError,
-    intrinsics_from_message,
-    labels_from_message,
-)
+from sq_msgs_py.depth_image import DEPTH_ENCODINGS, ImageError, intrinsics_from_message, labels_from_message
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings import publication

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,15 +11,17 @@ import pytest
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from frame_node_bench import CAMERA
-from geometry_msgs.msg import TransformStamped
+from frame_node_bench import CAMERA, Bench
 from packed_depth import pack
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
+from spun_nodes import SpunNodes
+from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_to_message, labels_to_message
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.nodes.frame import image_topic
 
 
 def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
@@ -46,6 +47,22 @@ def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
     header = bench.header()
     packed.publish(CompressedImage(header=header, format=form, data=data))
     bench.until(lambda: any(one.header == header for one in bench.answers))
+
+
+@pytest.mark.parametrize(
+    ("rules", "expected"),
+    [
+        ([], "/depth/image/compressedDepth"),
+        (["-r", "depth/image:=/camera/depth/image_rect_raw"], "/camera/depth/image_rect_raw/compressedDepth"),
+        (["-r", "depth/image:=/camera/image_rect/compressedDepth"], "/camera/image_rect/compressedDepth"),
+        (["-r", "__ns:=/robot"], "/robot/depth/image/compressedDepth"),
+    ],
+)
+def test_topics_of_packed_images_are_named_as_image_transport_names_them(rules, expected):
+    with SpunNodes(*rules) as nodes:
+        nodes.spin([])
+        assert image_topic(nodes.peer, "compressedDepth") == expected
+        assert image_topic(nodes.peer, "raw") == nodes.peer.resolve_topic_name("depth/image")
 
 
 def test_units_marks_and_ranges_are_read_as_in_files(make_bench, monkeypatch):
@@ -117,14 +134,24 @@ def cloud(points: np.ndarray, header: Header, labels: np.ndarray | None = None) 
     return found
 
 
-def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make_bench):
-    bench = make_bench("-p", "image_transport:=points", "-r", "depth/points:=/camera/points")
-    clouds = bench.peer.create_publisher(PointCloud2, "/camera/points", 5)
-    bench.until(clouds.get_subscription_count)
-    assert bench.infos.get_subscription_count() == 0, "the points say where the camera is"
+def seen_points() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A depth image, the column of each of its pixels, and its points."""
     depth = 0.5 + 0.003 * np.random.default_rng(5).random((48, 64))
     v, u = np.mgrid[:48, :64]
-    points = CAMERA.unproject(u, v, depth)
+    return depth, u, CAMERA.unproject(u, v, depth)
+
+
+def cloud_publisher(bench: Bench) -> Any:
+    clouds = bench.peer.create_publisher(PointCloud2, "depth/points", 5)
+    bench.until(clouds.get_subscription_count)
+    return clouds
+
+
+def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make_bench):
+    bench = make_bench("-p", "image_transport:=points")
+    clouds = cloud_publisher(bench)
+    assert bench.infos.get_subscription_count() == 0, "the points say where the camera is"
+    depth, _, points = seen_points()
     points[:5] = np.nan
     points[5, :9] = 0.0  # what some drivers send for nothing
 
@@ -159,10 +186,9 @@ def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make
 
 def test_a_cloud_that_is_no_image_has_pixels_of_no_mask(make_bench):
     bench = make_bench("-p", "image_transport:=points", "-p", "patience:=10.0")
-    clouds = bench.peer.create_publisher(PointCloud2, "depth/points", 5)
+    clouds = cloud_publisher(bench)
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
-    bench.until(lambda: clouds.get_subscription_count() and masks.get_subscription_count())
-    bench.until(lambda: bench.node.count_publishers("/mask/image"))
+    bench.until(lambda: masks.get_subscription_count() and bench.node.count_publishers("/mask/image"))
     points = np.random.default_rng(7).uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 0.502], (3000, 3)).astype(np.float32)
     row = cloud(points[None], bench.header())
 
@@ -185,26 +211,15 @@ def test_labels_of_points_are_masks_and_points_of_another_frame_are_moved_by_tf(
     """A labelled cloud of the robot's frame: seen from the camera, with masks, and without either in plain words."""
     turn, place = quaternions.normalize(np.array([0.6, -0.5, 0.4, -0.5])), np.array([0.3, -0.4, 1.2])
 
-    def lookup_transform(target: str, source: str, stamp: Any, patience: Any) -> TransformStamped:
+    def look_up(target: str, source: str, *_: Any) -> Any:
         if (target, source) != ("camera_optical", "base"):
             raise LookupError(f"{source} is not connected")
-        found = TransformStamped()
-        part, shift = found.transform.rotation, found.transform.translation
-        part.x, part.y, part.z, part.w = turn
-        shift.x, shift.y, shift.z = place
-        return found
+        return turn, place
 
-    buffer = SimpleNamespace(lookup_transform=lookup_transform, clear=lambda: None)
-    stand_in = SimpleNamespace(
-        Buffer=lambda: buffer, TransformListener=lambda *_: SimpleNamespace(unregister=lambda: None)
-    )
-    monkeypatch.setitem(sys.modules, "tf2_ros", stand_in)
+    Tf2(monkeypatch, look_up)
     bench = make_bench("-p", "image_transport:=points", "-p", "camera_frame:=camera_optical")
-    clouds = bench.peer.create_publisher(PointCloud2, "depth/points", 5)
-    bench.until(clouds.get_subscription_count)
-    depth = 0.5 + 0.003 * np.random.default_rng(5).random((48, 64))
-    v, u = np.mgrid[:48, :64]
-    seen = CAMERA.unproject(u, v, depth)
+    clouds = cloud_publisher(bench)
+    depth, u, seen = seen_points()
     there = (seen - place) @ quaternions.to_matrix(turn)
     labels = (u // 32 + 1).astype(np.int32)
 

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import gc
-import sys
 import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+import frame_node_bench
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from frame_node_bench import counts_of, every_frame_anew
+from frame_node_bench import CAMERA, ball, counts_of, info_of, stand_ins
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -29,49 +27,32 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from spun_nodes import PATIENCE, SpunNodes
+from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_msgs_py.depth_image import depth_to_message, labels_to_message
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.fitting.fit import Fit, Status
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import engine, managed_node
+from sq_perception.nodes import managed_node
 from sq_perception.nodes.frame_node import FrameNode
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
-
-CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+from sq_perception.recovery.recoverer import FrameRecovery
 
 
-class Recoverer:
+class Recoverer(frame_node_bench.Recoverer):
     """Answers one ball of the size that its model's name says, in centimetres."""
 
-    has_weights = True
-
     def __init__(self, model: str) -> None:
-        self.model = model
-        self.error: Exception | None = None
-        self.asked = 0
-        self.at_work = 0
-        self.most_at_work = 0
+        super().__init__()
+        self.bodies = (ball(radius=0.01 * float(model or 1)),)
+        self.at_work = self.most_at_work = 0
         self.duration = 0.0
 
-    def warm_up(self, camera: Camera) -> None:
-        self.warm = camera
-
-    def recover(self, depth: np.ndarray, camera: Camera, labels: Any, options: Any) -> FrameRecovery:
-        self.asked += 1
+    def recover(self, *given: Any) -> FrameRecovery:
         self.at_work += 1
         self.most_at_work = max(self.most_at_work, self.at_work)
         time.sleep(self.duration)
         self.at_work -= 1
-        if self.error is not None:
-            raise self.error
-        size = 0.01 * float(self.model or 1)
-        body = Superquadric(np.full(3, size), np.ones(2), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 0, 1.0]))
-        one = Recovery(Fit(body, 0.001, Status.CONVERGED, ""), 0.9, 1, 100)
-        return FrameRecovery((one,), {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
+        return super().recover(*given)
 
 
 class Bench(SpunNodes):
@@ -83,9 +64,7 @@ class Bench(SpunNodes):
         self.fault: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
-        weights = SimpleNamespace(resolve=lambda model: Path(f"{id(self)} {model}"), check=self._check)
-        made = {"Recoverer": self._make, "StillScene": every_frame_anew}
-        self.stand_ins = patch.multiple(engine, checkpoint=weights, **made)
+        self.stand_ins = stand_ins(self._make, lambda model: Path(f"{id(self)} {model}"), self._check)
         self.stand_ins.start()
         self.events: list[str] = []
         self.reports: list[DiagnosticStatus] = []
@@ -93,17 +72,10 @@ class Bench(SpunNodes):
             TransitionEvent, "/recover_node/transition_event", lambda e: self.events.append(e.goal_state.label), 50
         )
         self.peer.create_subscription(DiagnosticArray, "/diagnostics", lambda m: self.reports.extend(m.status), 50)
-        self.answers: dict[str, list[PointCloud2]] = {}
-        self.images: dict[str, Any] = {}
-        self.infos: dict[str, Any] = {}
-        for space in namespaces:
-            self.answers[space] = []
-            at = f"/{space}" if space else ""
-            self.images[space] = self.peer.create_publisher(Image, f"{at}/depth/image", 5)
-            self.infos[space] = self.peer.create_publisher(CameraInfo, f"{at}/depth/camera_info", 5)
-            self.peer.create_subscription(
-                PointCloud2, f"{at}/recover_node/superquadrics", self.answers[space].append, 50
-            )
+        at = {space: f"/{space}" if space else "" for space in namespaces}
+        self.answers = {one: self.hear(PointCloud2, f"{at[one]}/recover_node/superquadrics", 50) for one in at}
+        self.images = {one: self.peer.create_publisher(Image, f"{at[one]}/depth/image", 5) for one in at}
+        self.infos = {one: self.peer.create_publisher(CameraInfo, f"{at[one]}/depth/camera_info", 5) for one in at}
         self.nodes = [FrameNode("recover_node", namespace=space or None, context=self.context) for space in namespaces]
         self.node = self.nodes[0]
         self.spin(self.nodes, executor)
@@ -145,8 +117,7 @@ class Bench(SpunNodes):
     def publish(self, space: str = "", value: float = 0.5) -> Header:
         self.stamps += 1
         header = Header(stamp=Time(sec=1000 + self.stamps), frame_id=f"{space}_camera")
-        known = Intrinsics(CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
-        self.infos[space].publish(intrinsics_to_message(known, header))
+        self.infos[space].publish(info_of(CAMERA, header))
         self.images[space].publish(depth_to_message(np.full((48, 64), value), header))
         return header
 
@@ -230,22 +201,12 @@ class TestLifecycle:
         assert bench.change(Transition.TRANSITION_ACTIVATE)
         assert bench.active().answer() == 1.0
 
-    @pytest.mark.parametrize(
-        ("transition", "label"),
-        [
-            (Transition.TRANSITION_CONFIGURE, ""),
-            (Transition.TRANSITION_ACTIVATE, ""),
-            (Transition.TRANSITION_CLEANUP, ""),
-            (99, ""),
-            (0, ""),
-            (0, "nonsense"),
-            (0, "destroy"),
-        ],
-    )
-    def test_a_transition_that_is_not_allowed_is_refused_and_the_node_goes_on(self, make_bench, transition, label):
+    def test_a_transition_that_is_not_allowed_is_refused_and_the_node_goes_on(self, make_bench):
         bench = make_bench().active()
-        assert not bench.change(transition, label)
-        assert bench.state() == "active"
+        numbers = (Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CLEANUP, 99)
+        for transition, label in (*((number, "") for number in numbers), (0, ""), (0, "nonsense"), (0, "destroy")):
+            assert not bench.change(transition, label)
+            assert bench.state() == "active"
         assert bench.answer() == 1.0
 
     def test_services_answer_while_the_model_loads(self, make_bench):
@@ -288,6 +249,11 @@ class TestLifecycle:
         monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
         bench = make_bench().active()
         assert bench.answer() == 1.0
+        bench.made[0].error = ValueError("a hard frame")
+        bench.publish_refused(12)
+        bench.made[0].error = None
+        assert bench.answer() == 1.0
+        assert len(bench.made) == 1, "bad frames are no reason"
         bench.made[0].error = ZeroDivisionError("device lost")
         bench.publish_refused(10)
         bench.until(lambda: len(bench.made) == 2)  # another one, though the first is still there to be shared
@@ -324,20 +290,12 @@ class TestLifecycle:
         assert bench.node.state == "finalized"
         assert withdrawn == ["deactivating"]
 
-    def test_bad_frames_are_no_reason_to_start_anew(self, make_bench):
-        bench = make_bench().active()
-        bench.answer()
-        bench.made[-1].error = ValueError("a hard frame")
-        bench.publish_refused(12)
-        bench.made[-1].error = None
-        assert bench.answer() == 1.0
-        assert len(bench.made) == 1
-
-
 class TestSwap:
     def test_a_model_is_swapped_beside_the_work(self, make_bench):
         bench = make_bench().active()
+        assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful
         assert bench.answer() == 1.0
+        assert len(bench.made) == 1, "what does not concern the recoverer swaps nothing"
         bench.gate.clear()
         assert bench.node.set_parameters([Parameter("model", value="3")])[0].successful
         assert bench.answer() == 1.0, "the old one goes on until the new one is ready"
@@ -381,23 +339,10 @@ class TestSwap:
         bench.until(lambda: bench.node._engine.description == "method auto, 6 on cpu")
         assert bench.active().answer() == 6.0
 
-    def test_what_does_not_concern_the_recoverer_swaps_nothing(self, make_bench):
-        bench = make_bench().active()
-        assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful
-        bench.answer()
-        assert len(bench.made) == 1
-
-
 class TestSeveralCameras:
     @pytest.mark.parametrize("executor", [SingleThreadedExecutor, MultiThreadedExecutor, EventsExecutor])
     def test_two_cameras_in_one_process_share_a_recoverer_and_do_not_mix(self, make_bench, executor):
-        if executor is EventsExecutor:
-
-            def made(context: Any) -> Any:
-                return EventsExecutor(context=context)
-        else:
-            made = executor
-        bench = make_bench(namespaces=("front", "wrist"), executor=made).active()
+        bench = make_bench(namespaces=("front", "wrist"), executor=lambda context: executor(context=context)).active()
         assert len(bench.made) == 1
         bench.made[0].duration = 0.02
         for _ in range(5):
@@ -405,6 +350,9 @@ class TestSeveralCameras:
                 assert bench.answer(space) == 1.0
         for space in ("front", "wrist"):
             assert {one.header.frame_id for one in bench.answers[space]} == {f"{space}_camera"}
+        assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
+        bench.until(lambda: bench.nodes[1]._engine.description == "method auto, 7 on cpu")
+        assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0), "a swap leaves the other alone"
 
     def test_one_frame_at_a_time_and_nobody_starves(self, make_bench):
         bench = make_bench(namespaces=("front", "wrist")).active()
@@ -428,16 +376,13 @@ class TestSeveralCameras:
         waits, over = threading.Event(), threading.Event()
         given_up: list[bool] = []
 
-        def lookup_transform(target: str, source: str, stamp: Any, patience: Any) -> None:
+        def look_up(target: str, source: str, stamp: int, patience: Any) -> Any:
             if patience.nanoseconds:
                 waits.set()
                 given_up.append(not over.wait(PATIENCE / 3))
             raise LookupError("it does not come")
 
-        buffer = SimpleNamespace(lookup_transform=lookup_transform, clear=lambda: None)
-        listener = SimpleNamespace(unregister=lambda: None)
-        stand_in = SimpleNamespace(Buffer=lambda: buffer, TransformListener=lambda *_: listener)
-        monkeypatch.setitem(sys.modules, "tf2_ros", stand_in)
+        Tf2(monkeypatch, look_up)
         bench = make_bench(namespaces=("front", "wrist")).active()
         bench.answer("wrist")
         box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
@@ -464,16 +409,7 @@ class TestSeveralCameras:
             kept[space] = found.qos_profile.durability.name
         assert kept == {"front": "VOLATILE", "wrist": "TRANSIENT_LOCAL"}
 
-    def test_a_swap_on_one_camera_leaves_the_other_alone(self, make_bench):
-        bench = make_bench(namespaces=("front", "wrist")).active()
-        assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
-        bench.until(lambda: bench.nodes[1]._engine.description == "method auto, 7 on cpu")
-        assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0)
-
-
 def test_masks_that_come_later_than_newer_images_are_waited_for(make_bench):
-    from sq_msgs_py.depth_image import labels_to_message
-
     bench = make_bench("-p", "use_masks:=always", "-p", "patience:=5.0").active()
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
     bench.until(masks.get_subscription_count)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import types
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
@@ -16,7 +15,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 import soft_messages
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import TransformStamped
+from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 
 from sq_perception.fitting.fit import Fit, Status
@@ -49,12 +48,7 @@ def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Re
 
 
 def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
-    return Frame(
-        header,
-        "32FC1",
-        np.full((camera.height, camera.width), np.nan, np.float32),
-        Calibration(camera),
-    )
+    return Frame(header, "32FC1", np.full((camera.height, camera.width), np.nan, np.float32), Calibration(camera))
 
 
 def recovery(*bodies: Recovery) -> FrameRecovery:
@@ -134,6 +128,18 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Node:
     return made
 
 
+@pytest.fixture
+def outputs(node: Node) -> OptionalOutputs:
+    """All of them."""
+    made = OptionalOutputs(node)
+    made.follow(ALL)
+    return made
+
+
+def beside(body: Superquadric, x: float) -> Superquadric:
+    return Superquadric(body.size, body.shape, body.translation + [x, 0, 0], body.rotation)
+
+
 def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
     """Operation by id of a scene."""
     return {one.id: one.operation for one in publisher.sent[which].world.collision_objects}
@@ -177,9 +183,7 @@ def test_all_outputs_agree_on_names_poses_and_headers(node):
     assert [len(part) for part in (tree.transforms, seen.detections, scene.world.collision_objects)] == [2, 2, 2]
 
 
-def test_only_what_is_heard_is_made(node):
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
+def test_only_what_is_heard_is_made(node, outputs):
     for publisher in node.all:
         publisher.listeners = 0
     made = found(1, 2)
@@ -191,9 +195,7 @@ def test_only_what_is_heard_is_made(node):
     assert [len(publisher.sent) for publisher in node.all] == [1, 0, 0]
 
 
-def test_gone_objects_are_removed_and_hidden_ones_stay(node):
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
+def test_gone_objects_are_removed_and_hidden_ones_stay(node, outputs):
     scene = node.publishers[SCENE]
     add, remove = soft("moveit_msgs").CollisionObject.ADD, soft("moveit_msgs").CollisionObject.REMOVE
     outputs.publish(found(1, 2), ALL)
@@ -219,10 +221,8 @@ def test_gone_objects_are_removed_and_hidden_ones_stay(node):
     assert len(scene.sent) == count + 1, "no empty scenes"
 
 
-def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node):
+def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node, outputs):
     """A still scene, in which numbers quiver by tenths of a millimetre: one message, not one a frame."""
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
     scene = node.publishers[SCENE]
 
     def show(*bodies: Superquadric, **changes: Any) -> int:
@@ -232,21 +232,16 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
         outputs.publish(publication.findings(identified, HEADER, is_cube=False), replace(ALL, **changes))
         return len(objects(scene)) if len(scene.sent) > count else 0
 
-    def box(**changes: Any) -> Superquadric:
-        columns = {"size": BOX.size, "shape": BOX.shape, "translation": BOX.translation, "rotation": BOX.rotation}
-        return Superquadric(**{**columns, **changes})
-
-    quivers = box(translation=BOX.translation + 2e-4, size=BOX.size + 2e-4, rotation=-BOX.rotation)
+    quivers = Superquadric(BOX.size + 2e-4, BOX.shape, BOX.translation + 2e-4, -BOX.rotation)
     assert [show(BOX, CAN), show(quivers, CAN), show(BOX, CAN)] == [2, 0, 0]
     for moved in (
-        box(translation=BOX.translation + [0, 0, 0.003]),
-        box(size=BOX.size + [0.003, 0, 0]),
-        box(shape=[0.9, 0.6]),
-        box(rotation=[0.1, 0.2, 0.4, 0.9]),
+        Superquadric(BOX.size, BOX.shape, BOX.translation + [0, 0, 0.003], BOX.rotation),
+        Superquadric(BOX.size + [0.003, 0, 0], BOX.shape, BOX.translation, BOX.rotation),
+        Superquadric(BOX.size, [0.9, 0.6], BOX.translation, BOX.rotation),
+        Superquadric(BOX.size, BOX.shape, BOX.translation, [0.1, 0.2, 0.4, 0.9]),
     ):
         assert [show(moved, CAN), show(moved, CAN), show(BOX, CAN)] == [1, 0, 1]
-    slow = [box(translation=BOX.translation + [0.0005 * k, 0, 0]) for k in range(21)]
-    assert sum(show(one, CAN) for one in slow) == 4, "steps of half a millimetre add up to 10 mm"
+    assert sum(show(beside(BOX, 0.0005 * k), CAN) for k in range(21)) == 4, "steps of half a millimetre add up to 10 mm"
     show(BOX, CAN)
     scene.listeners = 2
     assert [show(BOX, CAN), show(BOX, CAN)] == [2, 0]
@@ -260,10 +255,8 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     assert show(BOX, CAN, collision_shapes="mesh") == 0
 
 
-def test_a_new_planner_is_told_of_what_an_arm_hides(node):
+def test_a_new_planner_is_told_of_what_an_arm_hides(node, outputs):
     """MoveIt is started again while the arm is before body 2; with a camera that moves nobody knows where that is."""
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
     scene = node.publishers[SCENE]
     outputs.publish(found(1, 2), ALL)
     (_, before) = scene.sent[-1].world.collision_objects
@@ -290,10 +283,8 @@ def test_a_new_planner_is_told_of_what_an_arm_hides(node):
     assert list(objects(scene)) == ["superquadric_1"], "planners that know it know it in its own frame"
 
 
-def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node):
+def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node, outputs):
     """It plans while one body goes and another one moves, and gets the last ten messages of that time."""
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
     known: dict[str, Any] = {}
 
     def heard(bodies: dict[int, Superquadric]) -> None:
@@ -308,9 +299,6 @@ def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node):
                 if thing.operation == soft("moveit_msgs").CollisionObject.ADD:
                     known[thing.id] = thing.pose.position.x
         scene.sent.clear()
-
-    def beside(body: Superquadric, x: float) -> Superquadric:
-        return Superquadric(body.size, body.shape, body.translation + [x, 0, 0], body.rotation)
 
     heard({1: BOX, 2: CAN, 3: BOX})
     take()
@@ -332,9 +320,7 @@ def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node):
     assert told == [3, 2], "removed by two repetitions, as a planner may miss the first, and no more"
 
 
-def test_switching_off_removes_and_ending_does_not(node):
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
+def test_switching_off_removes_and_ending_does_not(node, outputs):
     scene = node.publishers[SCENE]
     outputs.publish(found(1, 2), ALL)
     off = replace(ALL, publish_collision_objects=False)
@@ -385,9 +371,7 @@ def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, 
     assert tuple(outputs.absent) == (), "nobody asks for it any more"
 
 
-def test_images_without_frame_have_no_transforms_and_no_objects(node):
-    outputs = OptionalOutputs(node)
-    outputs.follow(ALL)
+def test_images_without_frame_have_no_transforms_and_no_objects(node, outputs):
     for _ in range(2):
         outputs.publish(found(1, header=Header()), ALL)
     assert [len(node.publishers[topic].sent) for topic in (TF, DETECTIONS, SCENE)] == [0, 2, 0]
@@ -400,45 +384,27 @@ def soft(package: str) -> Any:
 # Findings and their frame
 
 
-class Tf2:
-    """Stands for tf2_ros: one transform for each target frame."""
-
-    def __init__(self, **frames: tuple[np.ndarray, np.ndarray]) -> None:
-        self.frames, self.listeners, self.closed = frames, 0, 0
-        self.module: Any = types.ModuleType("tf2_ros")
-        self.module.Buffer = lambda: self
-        self.module.TransformListener = self.listen
-
-    def listen(self, buffer: Any, node: Any) -> Any:
-        self.listeners += 1
-        return SimpleNamespace(unregister=self.unregister)
-
-    def unregister(self) -> None:
-        self.closed += 1
-
-    def lookup_transform(self, target: str, source: str, time: Any, timeout: Any) -> TransformStamped:
-        if target not in self.frames or time.nanoseconds != 10_500_000_000:
-            raise LookupError(f"{target} does not exist")
-        turn, shift = self.frames[target]
-        result = TransformStamped()
-        part = result.transform.rotation
-        part.x, part.y, part.z, part.w = turn
-        result.transform.translation.x, result.transform.translation.y, result.transform.translation.z = shift
-        return result
+FRAMES = {
+    "map": (quaternions.from_rotation_vector(np.array([0.3, -1.1, 0.7])), np.array([1.0, -2.0, 0.5])),
+    "base": (np.array([0, 0, 0, 1.0]), np.zeros(3)),
+}
+"""Poses of the camera at 10.5 s."""
 
 
 @pytest.fixture
 def tf2(monkeypatch: pytest.MonkeyPatch) -> Tf2:
-    turn = quaternions.from_rotation_vector(np.array([0.3, -1.1, 0.7]))
-    stand_in = Tf2(map=(turn, np.array([1.0, -2.0, 0.5])), base=(np.array([0, 0, 0, 1.0]), np.zeros(3)))
-    monkeypatch.setitem(sys.modules, "tf2_ros", stand_in.module)
-    return stand_in
+    def look_up(target: str, source: str, stamp: int, timeout: Any) -> Any:
+        if target not in FRAMES or stamp != 10_500_000_000:
+            raise LookupError(f"{target} does not exist")
+        return FRAMES[target]
+
+    return Tf2(monkeypatch, look_up)
 
 
 def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
     here = found(1, 2)
     there = in_frame(here, CameraPoses(node), "map")
-    turn, shift = tf2.frames["map"]
+    turn, shift = FRAMES["map"]
     assert (there.header.frame_id, there.header.stamp) == ("map", HEADER.stamp)
     assert here.header.frame_id == "camera"
     for k, body in enumerate((CAN, BOX)):
@@ -448,17 +414,6 @@ def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
         np.testing.assert_array_equal(there.array.size[k], here.array.size[k])
     np.testing.assert_array_equal(there.array.sigma_size, here.array.sigma_size)
     assert in_frame(here, CameraPoses(node), "") is here
-
-
-def test_markers_follow_the_frame(node, tf2):
-    here = found(1, 2)
-    there = in_frame(here, CameraPoses(node), "map")
-    turn, shift = tf2.frames["map"]
-    one, other = (findings.markers() for findings in (here, there))
-    assert {marker.header.frame_id for marker in other.markers} == {"map"}
-    for k in range(4):
-        near, far = (np.array([[p.x, p.y, p.z] for p in array.markers[k].points]) for array in (one, other))
-        np.testing.assert_allclose(near @ quaternions.to_matrix(turn).T + shift, far, atol=1e-6)
 
 
 def test_markers_that_are_gone_are_deleted_for_a_while_and_all_of_them_at_once(monkeypatch):
@@ -496,7 +451,7 @@ def test_covariances_of_poses_are_about_the_axes_of_their_frame(node, tf2):
     turn = quaternions.to_matrix(BOX.rotation)
     np.testing.assert_allclose(here.covariances[0][3:, 3:], turn @ own @ turn.T, atol=1e-9)
     there = in_frame(here, CameraPoses(node), "map").covariances[0]
-    matrix = quaternions.to_matrix(tf2.frames["map"][0])
+    matrix = quaternions.to_matrix(FRAMES["map"][0])
     np.testing.assert_allclose(there[:3, :3], matrix @ np.diag([1e-6, 4e-6, 9e-6]) @ matrix.T, atol=1e-12)
     np.testing.assert_allclose(there[3:, 3:], matrix @ turn @ own @ turn.T @ matrix.T, atol=1e-9)
 
@@ -536,15 +491,15 @@ def test_all_frames_share_one_listener_and_none_is_there_before(node, tf2):
     assert tf2.listeners == 0
     for frame_id in ("map", "base", "map"):
         turn, shift = camera_poses.at(HEADER, frame_id)
-        np.testing.assert_allclose(turn, tf2.frames[frame_id][0])
-        np.testing.assert_allclose(shift, tf2.frames[frame_id][1])
+        np.testing.assert_allclose(turn, FRAMES[frame_id][0])
+        np.testing.assert_allclose(shift, FRAMES[frame_id][1])
     assert tf2.listeners == 1
     camera_poses.close()
     camera_poses.close()
     assert tf2.closed == 1
     np.testing.assert_allclose(camera_poses.at(HEADER, "map")[1], [1.0, -2.0, 0.5])
     assert tf2.listeners == 2
-    tf2.frames["map"] = (np.full(4, np.nan), np.zeros(3))
+    tf2.look_up = lambda *_: (np.full(4, np.nan), np.zeros(3))
     with pytest.raises(PoseError, match="no rigid motion"):
         camera_poses.at(HEADER, "map")
 
@@ -592,6 +547,7 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
         {"target_frame": "base//link"},
         {"target_frame": "base link"},
         {"target_frame": "map", "projection": "orthographic"},
+        {"fixed_frame": "map", "projection": "orthographic"},
     ],
 )
 def test_frames_that_tf2_would_not_take_are_refused(values):

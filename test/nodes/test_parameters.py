@@ -96,40 +96,39 @@ def test_s_refuses_what_is_no_sharpness(make_node, value):
 
 
 def test_changes_arrive_as_a_whole_and_integers_pass_as_floats(make_node):
-    node = make_node(tau=2, model="weights.safetensors")
+    """Given at the start or set: who reads them later expects what the description says."""
+    node = make_node(tau=2, model="weights.safetensors", workspace=[0, 0, 0, 1, 1, 1])
     live = LiveParameters(node, RecoverParameters)
     before = live.current
     assert (before.s, before.tau, before.model) == (117.3, 2.0, "weights.safetensors")
-    result = node.set_parameters_atomically([Parameter("s", value=3), Parameter("tau", value=1.5)])
-    assert result.successful
+    assert node.get_parameter("tau").type_ == Parameter.Type.DOUBLE
+    assert node.set_parameters_atomically([Parameter("s", value=3), Parameter("tau", value=1.5)]).successful
     assert (live.current.s, live.current.tau) == (3.0, 1.5)
     assert isinstance(live.current.s, float)
     assert (before.s, before.tau) == (117.3, 2.0)
+    assert node.get_parameter("s").type_ == Parameter.Type.DOUBLE
+    assert node.get_parameter("workspace").type_ == Parameter.Type.DOUBLE_ARRAY
+    assert node.get_parameter("max_objects").type_ == Parameter.Type.INTEGER
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"s": -1}, "out of range"),
-        ({"s": -1.0}, "out of range"),
-        ({"s": float("nan")}, "s"),
         ({"s": "sharp"}, "expected 'Type.DOUBLE' got 'Type.STRING'"),
         ({"method": "maybe"}, "auto, network, symmetry, classic"),
         ({"max_objects": 0}, "out of range"),
         ({"depth_max": 0.5, "depth_min": 0.6}, "depth_min < depth_max"),
         ({"projection": "orthographic"}, "read-only"),
-        ({"marker_alpha": 2}, "out of range"),
         ({"s": 5.0, "tau": -1}, "tau"),
     ],
 )
 def test_a_refused_change_changes_nothing_and_says_why(make_node, changes, words):
     node = make_node()
     live = LiveParameters(node, RecoverParameters)
-    before = live.current
     result = node.set_parameters_atomically([Parameter(name, value=value) for name, value in changes.items()])
     assert not result.successful
     assert words in result.reason
-    assert live.current == before == RecoverParameters()
+    assert live.current == RecoverParameters()
 
 
 @pytest.mark.parametrize(
@@ -138,6 +137,7 @@ def test_a_refused_change_changes_nothing_and_says_why(make_node, changes, words
         (RecoverParameters, {"s": 1e6}, "Parameter s out of range"),
         (RecoverParameters, {"projection": "fisheye"}, "pinhole, orthographic"),
         (RecoverParameters, {"model": 3}, "model"),
+        (RecoverParameters, {"tf_prefix": ""}, "expected something before the ids"),
         (RecoverParameters, {"depth_min": 2.0, "depth_max": 1.0}, "depth_min < depth_max"),
         (SyntheticParameters, {"scene": "replay"}, "path"),
         (SyntheticParameters, {"scene": "thesis", "encoding": "32FC1"}, "mono8 or mono16"),
@@ -170,43 +170,30 @@ def test_a_check_may_refuse_and_a_listener_hears_what_was_set(make_node):
     def check(candidate, names):
         if "model" in names and candidate.model == "bad":
             raise ValueError("model: no such file")
+        if candidate.model == "secret":
+            raise PermissionError(13, "Permission denied", candidate.model)
 
     node = make_node()
     live = LiveParameters(node, RecoverParameters, check=check, changed=lambda new, names: heard.append((new, names)))
     refused = node.set_parameters_atomically([Parameter("model", value="bad"), Parameter("s", value=3.0)])
     assert (refused.successful, refused.reason) == (False, "model: no such file")
+    assert "Permission denied" in node.set_parameters([Parameter("model", value="secret")])[0].reason
     assert (live.current, heard) == (RecoverParameters(), [])
     assert node.set_parameters_atomically([Parameter("model", value="good"), Parameter("s", value=3.0)]).successful
     assert heard == [(live.current, frozenset({"model", "s"}))]
-    assert node.set_parameters([Parameter("use_sim_time", value=False)])[0].successful
-    assert len(heard) == 1
-
-
-def test_parameters_of_others_change_nothing(make_node):
-    node = make_node()
-    live = LiveParameters(node, RecoverParameters)
     kept = live.current
+    assert node.set_parameters([Parameter("use_sim_time", value=False)])[0].successful
     node.declare_parameter("qos_overrides.somewhere", "reliable")
-    assert live.current is kept
-
-
-def test_a_file_that_cannot_be_looked_at_is_a_reason(make_node):
-    def check(candidate, names):
-        raise PermissionError(13, "Permission denied", candidate.model)
-
-    node = make_node()
-    LiveParameters(node, RecoverParameters, check=check)
-    refused = node.set_parameters([Parameter("model", value="secret.safetensors")])[0]
-    assert not refused.successful
-    assert "Permission denied" in refused.reason
+    assert live.current is kept, "parameters of others"
+    assert len(heard) == 1
 
 
 @pytest.mark.parametrize("given", [[0, -1, 0, 1, 1, 2], [0.0, -1.0, 0.0, 1.0, 1.0, 2.0]])
 def test_a_workspace_is_six_numbers_integers_or_not(make_node, given):
-    assert LiveParameters(make_node(), RecoverParameters).current.box is None
     assert LiveParameters(make_node(workspace=given), RecoverParameters).current.box == (0, -1, 0, 1, 1, 2)
     node = make_node()
     live = LiveParameters(node, RecoverParameters)
+    assert live.current.box is None
     assert node.set_parameters([Parameter("workspace", value=given)])[0].successful
     assert live.current.box == (0.0, -1.0, 0.0, 1.0, 1.0, 2.0)
     for wrong in ([0.0, 1.0], [0.0, 0.0, 0.0, 1.0, 1.0, -1.0], [float("nan")] * 6, "all"):
@@ -216,22 +203,9 @@ def test_a_workspace_is_six_numbers_integers_or_not(make_node, given):
     assert live.current.box == (0.0, -1.0, 0.0, 1.0, 1.0, 2.0)
 
 
-def test_doubles_stay_doubles(make_node):
-    """Given at the start or set as integers: who reads them later expects what the description says."""
-    node = make_node(tau=2, workspace=[0, 0, 0, 1, 1, 1])
-    LiveParameters(node, RecoverParameters)
-    assert node.set_parameters([Parameter("s", value=3)])[0].successful
-    for name in ("s", "tau"):
-        assert node.get_parameter(name).type_ == Parameter.Type.DOUBLE
-    assert node.get_parameter("workspace").type_ == Parameter.Type.DOUBLE_ARRAY
-    assert node.get_parameter("max_objects").type_ == Parameter.Type.INTEGER
-
-
 def test_a_file_of_the_values_in_force_can_be_loaded(make_node):
     """As `ros2 param load` of a `ros2 param dump` does, one by one, whether or not they may change now."""
     node = make_node()
     live = LiveParameters(node, RecoverParameters, locked=lambda: "is read when the node is configured")
     for name, value in asdict(live.current).items():
         assert node.set_parameters([Parameter(name, value=value)])[0].successful, name
-    refused = node.set_parameters([Parameter("projection", value="orthographic")])[0]
-    assert (refused.successful, refused.reason) == (False, "projection: is read when the node is configured")

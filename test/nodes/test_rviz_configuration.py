@@ -17,38 +17,17 @@ import yaml
 from sq_perception.recordings.publication import CAMERA_FRAME
 
 PROPERTIES = {
-    "rviz_default_plugins/Axes": {"Length", "Radius", "Reference Frame"},
-    "rviz_default_plugins/DepthCloud": {
-        "Alpha",
-        "Auto Size",
-        "Color",
-        "Color Image Topic",
-        "Color Transformer",
-        "Color Transport Hint",
-        "Decay Time",
-        "Depth Map Topic",
-        "Depth Map Transport Hint",
-        "Occlusion Compensation",
-        "Queue Size",
-        "Reliability Policy",
-        "Selectable",
-        "Style",
-        "Topic Filter",
-    },
-    "rviz_default_plugins/MarkerArray": {"Namespaces", "Topic"},
-    "rviz_default_plugins/TF": {
-        "Filter (blacklist)",
-        "Filter (whitelist)",
-        "Frame Timeout",
-        "Frames",
-        "Marker Scale",
-        "Show Arrows",
-        "Show Axes",
-        "Show Names",
-        "Tree",
-        "Update Interval",
-    },
-    "rviz_default_plugins/Image": {"Max Value", "Median window", "Min Value", "Normalize Range", "Topic"},
+    f"rviz_default_plugins/{display}": set(properties.split(", "))
+    for display, properties in {
+        "Axes": "Length, Radius, Reference Frame",
+        "DepthCloud": "Alpha, Auto Size, Color, Color Image Topic, Color Transformer, Color Transport Hint, Decay "
+        "Time, Depth Map Topic, Depth Map Transport Hint, Occlusion Compensation, Queue Size, Reliability Policy, "
+        "Selectable, Style, Topic Filter",
+        "MarkerArray": "Namespaces, Topic",
+        "TF": "Filter (blacklist), Filter (whitelist), Frame Timeout, Frames, Marker Scale, Show Arrows, Show Axes, "
+        "Show Names, Tree, Update Interval",
+        "Image": "Max Value, Median window, Min Value, Normalize Range, Topic",
+    }.items()
 }
 """What each display has beside Class, Enabled, Name and Value."""
 TOPIC = {"Depth", "Durability Policy", "History Policy", "Reliability Policy", "Value"}
@@ -131,11 +110,8 @@ def test_what_rviz_does_not_forgive_is_there(configuration: dict[str, Any]) -> N
     assert window["Hide Right Dock"] is False
     state = bytes.fromhex(window["QMainWindow State"])
     panels = {one["Name"] for one in configuration["Panels"]}
-    images = {
-        one["Name"]
-        for one in configuration["Visualization Manager"]["Displays"]
-        if one["Class"] == "rviz_default_plugins/Image"
-    }
+    displays = configuration["Visualization Manager"]["Displays"]
+    images = {one["Name"] for one in displays if one["Class"] == "rviz_default_plugins/Image"}
     for name in panels | images:
         assert name.encode("utf-16-be") in state, name
     assert all(one["Class"].startswith("rviz_common/") for one in configuration["Panels"])

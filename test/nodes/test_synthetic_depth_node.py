@@ -94,7 +94,7 @@ def test_the_truth_of_thesis_scenes_is_in_the_cube_frame():
     assert frame.truth.translation[0, 1] == pytest.approx(1 - v / 255)
 
 
-def test_a_folder_is_replayed_in_order(recordings):
+def test_a_folder_is_replayed_in_order_and_a_recording_alone(recordings):
     settings = {"scene": "replay", "path": str(recordings), "hold": 1}
     source = frame_source(SyntheticParameters(**settings))
     frames = [source.next(0.0) for _ in range(4)]
@@ -104,11 +104,8 @@ def test_a_folder_is_replayed_in_order(recordings):
     assert all(frame.truth is None for frame in frames)
     silent = frame_source(SyntheticParameters(**settings, masks="never"))
     assert all(silent.next(0.0).labels is None for _ in range(3))
-
-
-def test_one_recording_is_replayed_alone(recordings):
-    settings = SyntheticParameters(scene="replay", path=str(recordings / "2.npz"), hold=2, loop=False)
-    assert names(frame_source(settings), 3) == ["2.npz", "2.npz", None]
+    alone = {**settings, "path": str(recordings / "2.npz"), "hold": 2, "loop": False}
+    assert names(frame_source(SyntheticParameters(**alone)), 3) == ["2.npz", "2.npz", None]
 
 
 def test_a_damaged_recording_is_left_out(recordings):
@@ -150,14 +147,11 @@ def test_a_camera_is_that_of_its_parameter_or_lies_beside_the_image(tmp_path):
     )
     beside = frame_source(SyntheticParameters(scene="replay", path=str(tmp_path)))
     assert beside.clean.camera == Camera(64, 48, 70.0, 70.0, 31.5, 23.5)
-
-
-def test_a_table_is_seen_by_the_camera_of_a_file_without_its_distortion(tmp_path):
-    path = tmp_path / "lens.yaml"
-    path.write_text("{width: 320, height: 240, k: [262, 0, 159.5, 0, 260, 119.5, 0, 0, 1], d: [-0.2, 0.05, 0, 0, 0]}")
-    clean = frame_source(SyntheticParameters(camera_info_file=str(path))).clean
-    assert clean.camera == Camera(320, 240, 262.0, 260.0, 159.5, 119.5)
-    assert clean.depth.shape == (240, 320)
+    lens = tmp_path / "lens.yaml"
+    lens.write_text("{width: 320, height: 240, k: [262, 0, 159.5, 0, 260, 119.5, 0, 0, 1], d: [-0.2, 0.05, 0, 0, 0]}")
+    table = frame_source(SyntheticParameters(camera_info_file=str(lens))).clean
+    assert table.camera == Camera(320, 240, 262.0, 260.0, 159.5, 119.5), "without its distortion"
+    assert table.depth.shape == (240, 320)
 
 
 def test_a_node_replays_what_a_folder_holds(tmp_path):

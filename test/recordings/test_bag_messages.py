@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
+from random_bodies import random_bodies
 from rosbags.typesys import Stores, get_typestore
 
 from sq_msgs_py import columns, depth_image, superquadrics
@@ -29,20 +30,6 @@ def header(types):
     return types("std_msgs/msg/Header")(stamp=time, frame_id="camera_ä")
 
 
-def bodies(rng, count):
-    return SuperquadricArray(
-        size=rng.uniform(0.02, 0.3, (count, 3)),
-        shape=rng.uniform(0.1, 1.0, (count, 2)),
-        translation=rng.normal(size=(count, 3)),
-        rotation=rng.normal(size=(count, 4)),
-        score=rng.random(count),
-        residual=rng.random(count) * 1e-3,
-        sigma_size=np.where(rng.random((count, 3)) < 0.5, np.nan, 1e-3),
-        id=rng.integers(0, 2**32, count),
-        status=rng.integers(0, 3, count),
-    )
-
-
 def make(kind, types):
     """A message of every kind that is written, of random content that is the same for all types."""
     rng, at = np.random.default_rng(7), header(types)
@@ -56,7 +43,7 @@ def make(kind, types):
     if kind == "LabelImage":
         return depth_image.labels_to_message(rng.integers(0, 9, (5, 7)), at, "16UC1", types)
     if kind == "PointCloud2":
-        return superquadrics.to_message(bodies(rng, 3), at, types)
+        return superquadrics.to_message(random_bodies(3, rng), at, types)
     if kind == "EmptyCloud":
         return superquadrics.to_message(SuperquadricArray.empty(), at, types)
     shapes = Superquadric(
@@ -93,7 +80,7 @@ def test_constants_are_those_of_ros():
 
 
 def test_a_recorded_cloud_is_read_by_the_code_that_reads_a_live_one(rng):
-    before = bodies(rng, 4)
+    before = random_bodies(4, rng)
     data = bag_messages.as_cdr(superquadrics.to_message(before, header(bag_messages.types), bag_messages.types))
     after = superquadrics.from_message(TYPES.deserialize_cdr(data, "sensor_msgs/msg/PointCloud2"))
     for column in vars(before):

@@ -71,9 +71,9 @@ def test_an_organised_cloud_is_its_depth_image(tmp_path, kind):
         assert getattr(frame.camera, name) == pytest.approx(getattr(CAMERA, name), abs=1e-2)
     assert frame.has_free_space
     assert not frame.warning
-    assert (
-        read(pcd(tmp_path / "a.pcd", 1e3 * cloud), reading=Reading(scale=1000.0)).depth[50, 50] == frame.depth[50, 50]
-    )
+    path = pcd(tmp_path / "a.pcd", 1e3 * cloud)
+    path.write_bytes("# a comment may have any letters: mesuré\n".encode() + path.read_bytes())
+    assert read(path, reading=Reading(scale=1000.0)).depth[50, 50] == frame.depth[50, 50]
 
 
 def test_lzf_copies_what_came_before_and_stays_within_its_buffers():
@@ -86,13 +86,6 @@ def test_lzf_copies_what_came_before_and_stays_within_its_buffers():
     short, long, cut = (b"\x02abc", 4), (b"\x02abc", 2), (b"\x05abc", 6)
     for packed, size in (short, long, cut, (b"\x00a\x80\x05", 7), (b"\x00a\xe0", 9)):
         assert unpacked(packed, size) is None
-
-
-def test_a_comment_may_have_any_letters(tmp_path):
-    depth, cloud = points()
-    path = pcd(tmp_path / "a.pcd", cloud, "binary")
-    path.write_bytes("# .PCD v0.7 - mesuré\n".encode() + path.read_bytes())
-    np.testing.assert_allclose(read(path).depth, depth, rtol=1e-6)
 
 
 def test_a_cloud_in_any_order_is_seen_again(tmp_path):

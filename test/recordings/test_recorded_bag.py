@@ -37,7 +37,7 @@ T = {name.rpartition("/")[2]: kind for name, kind in TYPES.types.items()}
 SECOND = 10**9
 TOPIC, INFO = "/camera/depth/image_rect_raw", "/camera/depth/camera_info"
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
-STORAGES = (StoragePlugin.MCAP, StoragePlugin.SQLITE3)
+both_storages = pytest.mark.parametrize("storage", list(StoragePlugin), ids=lambda one: one.name)
 K = np.array([[200.0, 0, 79.5], [0, 200.0, 59.5], [0, 0, 1]])
 
 
@@ -47,26 +47,20 @@ def header(stamp: float) -> Any:
     return T["Header"](stamp=time, frame_id="depth_optical")
 
 
-def image(pixels: np.ndarray, stamp: float, encoding: str, *, big: bool = False, padding: int = 0) -> Any:
+def image(pixels: np.ndarray, stamp: float, encoding: str, *, big: bool = False, padding: int = 0, **wrong: Any) -> Any:
+    """Fields may be ``wrong``."""
     height, width = pixels.shape
-    kinds = {"16UC1": "u2", "32FC1": "f4", "mono8": "u1", "8UC1": "u1"}
-    rows = pixels.astype((">" if big else "<") + kinds[encoding]).view(np.uint8).reshape(height, -1)
+    kind = {"32FC1": "f4", "mono8": "u1", "8UC1": "u1"}.get(encoding, "u2")
+    rows = pixels.astype((">" if big else "<") + kind).view(np.uint8).reshape(height, -1)
     rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=255)
-    return T["Image"](
-        header=header(stamp),
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=int(big),
-        step=rows.shape[1],
-        data=rows.reshape(-1),
-    )
+    known = {"height": height, "width": width, "encoding": encoding, "is_bigendian": int(big), "step": rows.shape[1]}
+    return T["Image"](**{"header": header(stamp), **known, "data": rows.reshape(-1), **wrong})
 
 
-def packed(grey: np.ndarray, stamp: float, encoding: str, a: float = 0.0, b: float = 0.0) -> Any:
+def packed(grey: np.ndarray, stamp: float) -> Any:
     png = cv2.imencode(".png", grey)[1].tobytes()
-    data = np.frombuffer(struct.pack("<iff", 0, a, b) + png, np.uint8)
-    return T["CompressedImage"](header=header(stamp), format=f"{encoding}; compressedDepth png", data=data)
+    data = np.frombuffer(struct.pack("<iff", 0, 0.0, 0.0) + png, np.uint8)
+    return T["CompressedImage"](header=header(stamp), format="16UC1; compressedDepth png", data=data)
 
 
 def info(stamp: float, k: np.ndarray = K, size: tuple[int, int] = (160, 120), distortion: float = 0.0) -> Any:
@@ -121,24 +115,27 @@ def frames(path, **options):
         return list(bag)
 
 
+def recording(grey, *seconds):
+    """Contents of a bag: a camera_info, and the same image at these seconds."""
+    return [(INFO, 1, info(1)), *((TOPIC, second, image(grey, second, "16UC1")) for second in seconds)]
+
+
 def lone(folder):
     """The one storage file of a bag."""
     (path,) = [one for one in folder.iterdir() if one.suffix in (".mcap", ".db3")]
     return path
 
 
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
-@pytest.mark.parametrize("big", [False, True])
-@pytest.mark.parametrize("padding", [0, 7])
+@both_storages
+@pytest.mark.parametrize(("big", "padding"), [(False, 0), (True, 7)])
 def test_every_encoding_is_the_same_depth(tmp_path, grey, storage, big, padding):
     truth = metres(grey)
-    seconds = (1.5, 2.5, 3.5)
     messages = [
         image(grey, 1.5, "16UC1", big=big, padding=padding),
         image(truth, 2.5, "32FC1", big=big, padding=padding),
         image(np.where(grey > 0, truth, np.inf), 3.5, "32FC1", big=big, padding=padding),
     ]
-    contents = [(INFO, 1.5, info(1.5))] + [(TOPIC, at, one) for at, one in zip(seconds, messages, strict=True)]
+    contents = [(INFO, 1.5, info(1.5))] + [(TOPIC, 1.5 + k, one) for k, one in enumerate(messages)]
     bag = write(tmp_path / "bag", contents, storage)
     for path in (bag, lone(bag)):
         found = frames(path)
@@ -151,31 +148,12 @@ def test_every_encoding_is_the_same_depth(tmp_path, grey, storage, big, padding)
         assert found[0].name == "bag_1.500000000"
 
 
-def test_packed_millimetres_are_the_same_depth(tmp_path, grey):
-    topic = TOPIC + "/compressedDepth"
-    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (topic, 1, packed(grey, 1, "16UC1"))])
-    (frame,) = frames(bag)
-    assert frame.topic == topic
-    np.testing.assert_array_equal(frame.depth, metres(grey))
-
-
-def test_packed_inverse_depth_comes_back_within_its_quantum(grey):
-    truth = metres(grey)
-    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
-    levels = np.where(np.isfinite(truth), np.round(a / truth + b), 0).astype(np.uint16)
-    message = packed(levels, 1, "32FC1", a, b)
-    depth = compressed_depth.decode(message.format, message.data)
-    np.testing.assert_array_equal(np.isnan(depth), np.isnan(truth))
-    seen = np.isfinite(truth)
-    assert (np.abs(depth - truth)[seen] <= 0.51 * truth[seen] ** 2 / a + 1e-6).all()
-
-
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@both_storages
 @pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.STORAGE], ids=lambda mode: mode.name)
 def test_compressed_bags(tmp_path, grey, storage, mode):
     if (storage, mode) == (StoragePlugin.SQLITE3, CompressionMode.STORAGE):
         pytest.skip("sqlite3 has no compression of its own")
-    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))], storage, mode)
+    bag = write(tmp_path / "bag", recording(grey, 1), storage, mode)
     for path in (bag, lone(bag)):
         (frame,) = frames(path)
         np.testing.assert_array_equal(frame.depth, metres(grey))
@@ -209,10 +187,10 @@ def test_a_camera_info_belongs_to_the_image_of_its_stamp(tmp_path, grey):
     assert [frame.stamp.sec for frame in found] == [1, 2, 3, 4, 5]
 
 
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@both_storages
 def test_a_late_camera_info_serves_all(tmp_path, grey, storage):
-    contents = [(TOPIC, second, image(grey, second, "16UC1")) for second in (1, 2, 3)] + [(INFO, 9, info(0))]
-    assert [frame.camera for frame in frames(write(tmp_path / "bag", contents, storage))] == [CAMERA] * 3
+    late = write(tmp_path / "bag", [*recording(grey, 1, 2, 3)[1:], (INFO, 9, info(0))], storage)
+    assert [frame.camera for frame in frames(late)] == [CAMERA] * 3
 
 
 def test_a_missing_camera_info_is_named_and_can_be_given(tmp_path, grey):
@@ -255,7 +233,7 @@ def test_marks_units_and_ranges_are_those_of_files(tmp_path, grey):
         [
             (TOPIC, image(np.where(holes, 65535, grey), 1, "16UC1")),
             (TOPIC, image(np.where(holes, 10.0, metres(grey) / 2), 1, "32FC1")),
-            (TOPIC + "/compressedDepth", packed(np.where(holes, 65535, grey).astype(np.uint16), 1, "16UC1")),
+            (TOPIC + "/compressedDepth", packed(np.where(holes, 65535, grey).astype(np.uint16), 1)),
         ]
     ):
         (frame,) = frames(write(tmp_path / f"bag{number}", [(INFO, 1, info(1)), (topic, 1, message)]))
@@ -293,14 +271,12 @@ def test_distortion_is_undone_unless_the_topic_is_a_rectified_one(tmp_path, grey
 
 
 def test_the_topic_is_found_by_encoding_and_several_must_be_chosen_from(tmp_path, grey):
-    colour = image(np.zeros((4, 4)), 1, "8UC1")
-    colour.encoding = "mono8"
     other = "/aligned/image_raw"
     contents = [
-        ("/infra/image", 1, colour),
+        ("/infra/image", 1, image(np.zeros((4, 4)), 1, "mono8")),
         (INFO, 1, info(1)),
         ("/aligned/camera_info", 1, info(1)),
-        (TOPIC + "/compressedDepth", 1, packed(grey, 1, "16UC1")),
+        (TOPIC + "/compressedDepth", 1, packed(grey, 1)),
         (TOPIC, 1, image(grey, 1, "16UC1")),
     ]
     (frame,) = frames(write(tmp_path / "one", contents))
@@ -333,7 +309,7 @@ def test_orthographic_images(tmp_path):
     np.testing.assert_array_equal(frame.depth, unit_cube.depth_from_grey(grey))
 
 
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@both_storages
 def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tmp_path, grey, storage):
     """Before and after their images, not in their order; the third image has none, and the last comes twice."""
     contents = [(INFO, 0, info(0))]
@@ -357,11 +333,8 @@ def test_images_without_a_stamp_have_no_mask(tmp_path, grey):
 
 def test_masks_that_are_ignored_are_not_read(tmp_path, grey):
     """As a coloured picture of segments on a topic of that name."""
-    colour = image(grey, 1, "16UC1")
-    colour.encoding = "rgb8"
-    path = write(
-        tmp_path / "bag", [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 1, "16UC1")), ("/mask/image", 1, colour)]
-    )
+    colour = image(grey, 1, "rgb8")
+    path = write(tmp_path / "bag", [*recording(grey, 1), ("/mask/image", 1, colour)])
     (refused,) = frames(path)
     assert "got 'rgb8'" in str(refused)
     (frame,) = frames(path, reading=Reading(ignore_masks=True))
@@ -369,8 +342,7 @@ def test_masks_that_are_ignored_are_not_read(tmp_path, grey):
 
 
 def test_where_a_mask_cannot_be_read_no_other_segments_are_taken_for_it(tmp_path, grey):
-    contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in (1, 2)]
-    contents += [("/mask/image", 1, image(np.ones_like(grey), 1, "8UC1"))]
+    contents = [*recording(grey, 1, 2), ("/mask/image", 1, image(np.ones_like(grey), 1, "8UC1"))]
     cut = bytes(TYPES.serialize_cdr(image(np.ones_like(grey), 2, "8UC1"), "sensor_msgs/msg/Image"))[:-100]
     first, second = frames(write(tmp_path / "bag", [*contents, ("/mask/image", 2, cut)]))
     assert (first.labels == 1).all()
@@ -379,7 +351,7 @@ def test_where_a_mask_cannot_be_read_no_other_segments_are_taken_for_it(tmp_path
 
 
 def test_of_several_topics_with_masks_none_is_taken_and_frames_say_so(tmp_path, grey):
-    contents = [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 1, "16UC1"))]
+    contents = recording(grey, 1)
     contents += [(topic, 1, image(np.ones_like(grey), 1, "8UC1")) for topic in ("/b/mask/image", "/a/mask/image")]
     (frame,) = frames(write(tmp_path / "bag", contents))
     assert frame.labels is None
@@ -388,8 +360,7 @@ def test_of_several_topics_with_masks_none_is_taken_and_frames_say_so(tmp_path, 
 
 @pytest.mark.parametrize(("every", "limit", "wanted"), [(1, None, 7), (3, None, 3), (2, 2, 2), (1, 9, 7), (8, 1, 1)])
 def test_every_and_limit(tmp_path, grey, every, limit, wanted):
-    contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 8)]
-    write(tmp_path / "bag", contents)
+    write(tmp_path / "bag", recording(grey, *range(1, 8)))
     with RecordedBag(tmp_path / "bag", InputOptions(every=every, limit=limit)) as bag:
         assert len(bag) == wanted
         assert [frame.stamp.sec for frame in bag] == list(range(1, 8, every))[:limit]
@@ -399,34 +370,30 @@ def test_every_and_limit(tmp_path, grey, every, limit, wanted):
 
 def hostile(grey):
     """Images that are none: name -> message, and what is said about it."""
-    sound = bytes(TYPES.serialize_cdr(image(grey, 2, "16UC1"), "sensor_msgs/msg/Image"))
-    short = image(grey, 2, "16UC1")
-    short.data = short.data[:-1]
-    huge = image(grey, 2, "16UC1")
-    huge.height = huge.width = 2**32 - 1
-    wide = image(grey, 2, "16UC1")
-    wide.width = 2**31
-    colour = image(grey, 2, "16UC1")
-    colour.encoding = "rgb8"
+    whole = image(grey, 2, "16UC1")
+    sound = bytes(TYPES.serialize_cdr(whole, "sensor_msgs/msg/Image"))
+
+    def wrong(**fields):
+        return image(grey, 2, "16UC1", **fields)
+
     return {
         "half a message": (sound[:100], "recorded at 2.000000000"),
         "no message": (b"", "recorded at 2.000000000"),
         "noise": (bytes(range(256)), "recorded at 2.000000000"),
         "a length of 4 GB": (sound[:60].replace(b"16UC1", b"\xff" * 5) + b"\xff" * 60, "recorded at 2.000000000"),
-        "a byte missing": (short, "at 2.000000000: data: expected height x step"),
-        "a size of 2^64 pixels": (huge, "step: expected"),
-        "a row beyond its step": (wide, "step: expected"),
-        "colour": (colour, "encoding: expected 16UC1"),
+        "a byte missing": (wrong(data=whole.data[:-1]), "at 2.000000000: data: expected height x step"),
+        "a size of 2^64 pixels": (wrong(height=2**32 - 1, width=2**32 - 1), "step: expected"),
+        "a row beyond its step": (wrong(width=2**31), "step: expected"),
+        "colour": (image(grey, 2, "rgb8"), "encoding: expected 16UC1"),
         "another size": (image(grey[:50], 2, "16UC1"), "does not fit"),
     }
 
 
 @pytest.mark.parametrize("what", hostile(np.zeros((120, 160), np.uint16)))
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@both_storages
 def test_broken_messages_are_named_and_skipped(tmp_path, grey, storage, what):
     message, reason = hostile(grey)[what]
-    contents = [(INFO, 1, info(1))] + [(TOPIC, 1, image(grey, 1, "16UC1"))] + [(TOPIC, 2, message)]
-    contents += [(TOPIC, 3, image(grey, 3, "16UC1"))]
+    contents = [*recording(grey, 1), (TOPIC, 2, message), *recording(grey, 3)[1:]]
     first, error, last = frames(write(tmp_path / "bag", contents, storage))
     assert (first.stamp.sec, last.stamp.sec) == (1, 3)
     assert isinstance(error, FrameError)
@@ -435,7 +402,7 @@ def test_broken_messages_are_named_and_skipped(tmp_path, grey, storage, what):
 
 
 def test_a_broken_camera_info_is_named_and_the_last_good_one_serves(tmp_path, grey):
-    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 2, image(grey, 2, "16UC1"))], StoragePlugin.SQLITE3)
+    bag = write(tmp_path / "bag", recording(grey, 2), StoragePlugin.SQLITE3)
     with sqlite3.connect(lone(bag)) as database:
         ((topic_id, data),) = database.execute("SELECT topic_id, data FROM messages WHERE timestamp = 1000000000")
         database.execute("INSERT INTO messages VALUES (9, ?, 1500000000, ?)", (topic_id, data[:40]))
@@ -498,11 +465,10 @@ def test_bombs_do_not_unpack():
             unpack(bomb[: len(bomb) // 2], 2**26)
 
 
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@both_storages
 @pytest.mark.parametrize("kept", [0.0, 0.001, 0.4, 0.9, 0.999])
 def test_truncated_files_are_named(tmp_path, grey, storage, kept):
-    contents = [(INFO, 1, info(1))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 9)]
-    path = lone(write(tmp_path / "bag", contents, storage))
+    path = lone(write(tmp_path / "bag", recording(grey, *range(1, 9)), storage))
     content = path.read_bytes()
     path.write_bytes(content[: int(kept * len(content))])
     for bag in (tmp_path / "bag", path):
@@ -517,10 +483,9 @@ def test_truncated_files_are_named(tmp_path, grey, storage, kept):
                 np.testing.assert_array_equal(frame.depth, metres(grey))
 
 
-@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@both_storages
 def test_damaged_files_never_raise_anything_else(tmp_path, grey, storage, rng):
-    contents = [(INFO, 1, info(1))] + [(TOPIC, second, image(grey[:12, :16], second, "16UC1")) for second in (1, 2)]
-    path = lone(write(tmp_path / "bag", contents, storage))
+    path = lone(write(tmp_path / "bag", recording(grey[:12, :16], 1, 2), storage))
     content = np.frombuffer(path.read_bytes(), np.uint8)
     for _ in range(60):
         damaged = content.copy()
@@ -591,9 +556,9 @@ def test_a_frame_has_the_same_numbers_from_every_kind_of_recording(tmp_path):
         yaml.safe_dump({"image_width": 160, "image_height": 120, "camera_matrix": {"data": K.ravel().tolist()}})
     )
     messages = {
-        "bag": [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))],
+        "bag": recording(grey, 1),
         "metric": [(INFO, 1, info(1)), (TOPIC, 1, image(metres(grey), 1, "32FC1", big=True, padding=3))],
-        "packed": [(INFO, 1, info(1)), (TOPIC + "/compressedDepth", 1, packed(grey, 1, "16UC1"))],
+        "packed": [(INFO, 1, info(1)), (TOPIC + "/compressedDepth", 1, packed(grey, 1))],
     }
     bags = [write(tmp_path / name, content) for name, content in messages.items()]
     reference, *others = recovered(tmp_path, tmp_path / "frame.npz", png.parent, *bags)
@@ -636,7 +601,7 @@ def test_absurd_cameras_are_no_crash(tmp_path, grey, focal, size, capsys):
 
 def test_a_database_cannot_make_up_large_messages(tmp_path, grey):
     """A computed column is a blob of a gigabyte that takes no room in the file."""
-    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))], StoragePlugin.SQLITE3)
+    bag = write(tmp_path / "bag", recording(grey, 1), StoragePlugin.SQLITE3)
     with sqlite3.connect(lone(bag)) as database:
         database.execute("ALTER TABLE messages RENAME COLUMN data TO stored")
         database.execute(f"ALTER TABLE messages ADD COLUMN data AS (zeroblob({bag_reader.LARGEST + 1}))")

@@ -144,9 +144,8 @@ def test_sdf_holds_what_its_specification_knows(tmp_path: Path, meshes: bool) ->
         pose = link.find("pose")
         assert pose is not None
         assert pose.get("rotation_format") == "quat_xyzw"
-        np.testing.assert_allclose(
-            np.fromstring(pose.text, sep=" "), [*solid.position, *solid.rotation], atol=PRECISION
-        )
+        expected = [*solid.position, *solid.rotation]
+        np.testing.assert_allclose(np.fromstring(pose.text, sep=" "), expected, atol=PRECISION)
         for part in ("collision", "visual"):
             shape = link.find(f"{part}/geometry/{solid.kind}")
             assert shape is not None

@@ -8,20 +8,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from random_bodies import random_bodies
 
 from sq_msgs_py.answers import from_response, grasps_from_response, text_of
 from sq_msgs_py.grasps import GraspArray
-from sq_msgs_py.superquadrics import MessageError, SuperquadricArray
+from sq_msgs_py.superquadrics import MessageError
 
 HEADER = SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=7, nanosec=5))
 
 
 def bodies(count):
-    rng = np.random.default_rng(count)
-    columns = {name: rng.random((count, width)) for name, width in [("size", 3), ("shape", 2), ("translation", 3)]}
-    columns |= {"rotation": rng.random((count, 4)), "score": rng.random(count), "residual": np.full(count, np.nan)}
-    columns |= {"sigma_size": rng.random((count, 3)), "id": 2**31 + np.arange(count), "status": np.arange(count) % 3}
-    return SuperquadricArray(**columns)
+    return random_bodies(count, np.random.default_rng(count))
 
 
 def answered(text, success=True):

@@ -28,12 +28,7 @@ def message(kind: str = "f4", order: str = "<", names: str = "zyx", padding: int
         SimpleNamespace(name=name, offset=k * size, datatype=KINDS[kind], count=1) for k, name in enumerate(names)
     ]
     return SimpleNamespace(
-        height=2,
-        width=4,
-        fields=fields,
-        is_bigendian=order == ">",
-        point_step=step,
-        row_step=step * (4 + padding),
+        height=2, width=4, fields=fields, is_bigendian=order == ">", point_step=step, row_step=step * (4 + padding),
         data=rows.tobytes(),
     )
 

@@ -156,15 +156,9 @@ def test_a_mesh_message_holds_what_it_was_made_of():
 
 def test_arrays_get_one_solid_each():
     array = SuperquadricArray(
-        size=np.stack([SIZE, ROUND]),
-        shape=np.array([[0.1, 0.1], [0.1, 1.0]]),
-        translation=np.zeros((2, 3)),
-        rotation=np.tile(HERE, (2, 1)),
-        score=np.ones(2),
-        residual=np.zeros(2),
-        sigma_size=np.zeros((2, 3)),
-        id=np.array([1, 2]),
-        status=np.array([0, 0]),
+        size=np.stack([SIZE, ROUND]), shape=np.array([[0.1, 0.1], [0.1, 1.0]]), translation=np.zeros((2, 3)),
+        rotation=np.tile(HERE, (2, 1)), score=np.ones(2), residual=np.zeros(2), sigma_size=np.zeros((2, 3)),
+        id=np.array([1, 2]), status=np.array([0, 0]),
     )
     assert [solid.kind for solid in primitives(array)] == [BOX, CYLINDER]
 

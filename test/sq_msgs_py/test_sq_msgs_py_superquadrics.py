@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("sensor_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
 
 from builtin_interfaces.msg import Time
+from random_bodies import random_bodies
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 from visualization_msgs.msg import Marker, MarkerArray
@@ -30,29 +31,6 @@ LAYOUT_LAST = "kx ky objectness part"
 LAYOUT_1 = "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status"
 
 
-def some(count: int, rng: np.random.Generator) -> SuperquadricArray:
-    return SuperquadricArray(
-        size=rng.uniform(0.02, 0.3, (count, 3)),
-        shape=rng.uniform(0.1, 1.0, (count, 2)),
-        translation=rng.normal(size=(count, 3)),
-        rotation=rng.normal(size=(count, 4)),
-        score=rng.random(count),
-        residual=rng.random(count) * 1e-3,
-        sigma_size=rng.random((count, 3)) * 1e-3,
-        id=rng.integers(0, 2**32, count),
-        status=rng.integers(0, 3, count),
-        label=rng.integers(0, 2**16, count),
-        seen=rng.integers(0, 1000, count),
-        fused=rng.integers(0, 2, count),
-        reason=rng.integers(0, 16, count),
-        sigma_shape=rng.random((count, 2)),
-        sigma_centre=rng.random((count, 3)) * 1e-3,
-        sigma_turn=rng.random((count, 3)),
-        taper=rng.uniform(-0.5, 0.5, (count, 2)),
-        objectness=rng.random(count),
-    )
-
-
 def test_the_published_layout_does_not_change() -> None:
     """Other programs read these names and types: whoever changes them raises VERSION and this test; more may follow."""
     assert superquadrics.VERSION == 1
@@ -66,33 +44,17 @@ def test_the_published_layout_does_not_change() -> None:
 
 def test_one_body_reads_by_hand() -> None:
     body = SuperquadricArray(
-        size=np.array([[1.0, 2.0, 3.0]]),
-        shape=np.array([[0.25, 0.5]]),
-        translation=np.array([[4.0, 5.0, 6.0]]),
-        rotation=np.array([[0.0, 0.0, 0.0, 1.0]]),
-        score=np.array([0.75]),
-        residual=np.array([0.125]),
-        sigma_size=np.array([[7.0, 8.0, 9.0]]),
-        id=np.array([4_000_000_000]),
-        status=np.array([1]),
-        label=np.array([12]),
-        seen=np.array([3]),
-        fused=np.array([1]),
-        reason=np.array([Reason.OPEN_Z | Reason.HULL]),
-        sigma_shape=np.array([[0.25, 0.5]]),
-        sigma_centre=np.array([[1.5, 2.5, 3.5]]),
-        sigma_turn=np.array([[0.5, 0.25, 0.125]]),
-        taper=np.array([[0.5, -0.25]]),
-        objectness=np.array([0.875]),
+        size=np.array([[1.0, 2.0, 3.0]]), shape=np.array([[0.25, 0.5]]), translation=np.array([[4.0, 5.0, 6.0]]),
+        rotation=np.array([[0.0, 0.0, 0.0, 1.0]]), score=np.array([0.75]), residual=np.array([0.125]),
+        sigma_size=np.array([[7.0, 8.0, 9.0]]), id=np.array([4_000_000_000]), status=np.array([1]),
+        label=np.array([12]), seen=np.array([3]), fused=np.array([1]), reason=np.array([Reason.OPEN_Z | Reason.HULL]),
+        sigma_shape=np.array([[0.25, 0.5]]), sigma_centre=np.array([[1.5, 2.5, 3.5]]),
+        sigma_turn=np.array([[0.5, 0.25, 0.125]]), taper=np.array([[0.5, -0.25]]), objectness=np.array([0.875]),
         part=np.array([2]),
     )
     message = superquadrics.to_message(body, HEADER)
     assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
-        HEADER,
-        1,
-        1,
-        140,
-        140,
+        HEADER, 1, 1, 140, 140,
     )
     numbers = struct.unpack("<17f6I11fI", message.data.tobytes())
     before = (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
@@ -103,7 +65,7 @@ def test_one_body_reads_by_hand() -> None:
 
 def test_a_cloud_of_release_0_2_0_is_read(rng: np.random.Generator) -> None:
     """As its writer laid it out: 76 bytes a point, no field behind the status."""
-    before = some(3, rng)
+    before = random_bodies(3, rng)
     columns = (before.translation, before.rotation, before.size, before.shape, before.score, before.residual)
     flat = np.column_stack([*columns, before.sigma_size])
     points = [struct.pack("<17f2I", *flat[k], before.id[k], before.status[k]) for k in range(3)]
@@ -125,7 +87,7 @@ def test_a_cloud_of_release_0_2_0_is_read(rng: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("count", [0, 1, 10])
 def test_the_round_trip_keeps_every_number(count: int, rng: np.random.Generator) -> None:
-    before = some(count, rng)
+    before = random_bodies(count, rng)
     after = superquadrics.from_message(superquadrics.to_message(before, HEADER))
     assert len(after) == count
     for column in COLUMNS:
@@ -134,7 +96,7 @@ def test_the_round_trip_keeps_every_number(count: int, rng: np.random.Generator)
 
 
 def test_unknown_uncertainty_travels_and_is_declared(rng: np.random.Generator) -> None:
-    before = some(2, rng)
+    before = random_bodies(2, rng)
     unknown = SuperquadricArray(**{**vars(before), "sigma_size": np.full((2, 3), np.nan)})
     message = superquadrics.to_message(unknown, HEADER)
     assert not message.is_dense
@@ -143,7 +105,7 @@ def test_unknown_uncertainty_travels_and_is_declared(rng: np.random.Generator) -
 
 def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator) -> None:
     """A message as another writer might lay it out: big endian, doubles, other order, a field more, two padded rows."""
-    bodies = some(4, rng)
+    bodies = random_bodies(4, rng)
     names = [name for name, _ in FIELDS][::-1]
     layout = np.dtype({
         "names": ["extra", *names],
@@ -172,7 +134,7 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
 
 
 def broken(change: str, rng: np.random.Generator) -> PointCloud2:
-    message = superquadrics.to_message(some(3, rng), HEADER)
+    message = superquadrics.to_message(random_bodies(3, rng), HEADER)
     if change == "no exponent":
         message.fields = [field for field in message.fields if field.name != "e1"]
     elif change == "no field":
@@ -224,7 +186,7 @@ def test_other_clouds_are_refused_with_the_reason(change: str, words: str, rng: 
 )
 def test_columns_that_do_not_fit_are_refused(column: str, value: Any, rng: np.random.Generator) -> None:
     with pytest.raises(ValueError, match=f"{column}: expected"):
-        SuperquadricArray(**{**vars(some(2, rng)), column: value})
+        SuperquadricArray(**{**vars(random_bodies(2, rng)), column: value})
 
 
 TETRAHEDRON = (
