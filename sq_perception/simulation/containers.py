@@ -26,10 +26,6 @@ from sq_perception.simulation.thing import (
 _OVERLAP, _EDGE = 0.56, 0.1
 """Half height of the slabs that revolved objects are stacked of, in their distance, and e1: where two meet, the surface
 is 0.6 % nearer to the axis."""
-_LEVELS = 100
-"""At which a cavity is looked at."""
-_NARROW = 0.3
-"""Share of the rim's radius: plates have none that is wider."""
 
 
 def bottle(rng: np.random.Generator) -> Thing:
@@ -165,7 +161,7 @@ def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat
     At the height z a superquadric of the half height h has the radius a (1 - |z / h|^(2 / e1))^(e1 / 2).
     """
     count = len(radii)
-    z = np.linspace(wall, height, _LEVELS, endpoint=False)
+    z = np.linspace(wall, height, 100, endpoint=False)
     up = (z[:, None] - height * (np.arange(count) + 0.5) / count) / (_OVERLAP * height / count)
     outer = (radii * np.maximum(1 - np.abs(up) ** (2 / _EDGE), 0.0) ** (_EDGE / 2)).max(axis=1)
     down = (height - z) / (height - wall)
@@ -175,7 +171,7 @@ def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat
         radius = float(((outer - wall) / profile).min())
         if radius > widest + 1e-4:
             widest, best = radius, e1
-    if widest < _NARROW * radii[-1]:
+    if widest < 0.3 * radii[-1]:
         return []
     return [part((widest, flat * widest, height - wall), (best, e2), (0, 0, height))]
 

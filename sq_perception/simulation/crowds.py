@@ -22,10 +22,6 @@ PITCH = tuple(np.deg2rad([30.0, 65.0]))
 RADIUS = 0.25
 PUSHED = 0.7
 """Share of the bodies that touch another one."""
-_ATTEMPTS = 200
-_VIEWS = 10
-_CONTACT = 2e-4
-_SURFACE_SAMPLES = 1500
 
 
 def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
@@ -38,10 +34,10 @@ def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAME
     """
     if not 1 <= count <= MOST:
         raise ValueError(f"count: expected 1 to {MOST} bodies, got {count}")
-    for _ in range(_VIEWS):
+    for _ in range(10):
         plane = table_plane(rng, DISTANCE, PITCH)
         bodies: list[_Placed] = []
-        for _ in range(_ATTEMPTS):
+        for _ in range(200):
             drawn = resting_body(rng, plane, RADIUS)[0]
             if not inside_image(drawn, camera):
                 continue
@@ -64,7 +60,7 @@ class _Placed:
 
     @classmethod
     def of(cls, body: Superquadric, rng: np.random.Generator) -> _Placed:
-        return cls(body, body.sample_surface(_SURFACE_SAMPLES, rng, oversampling=2))
+        return cls(body, body.sample_surface(1500, rng, oversampling=2))
 
     def move(self, by: np.ndarray) -> _Placed:
         return _Placed(self.body.transformed(np.array([0.0, 0.0, 0.0, 1.0]), by), self.surface + by)
@@ -84,7 +80,7 @@ def _push(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
     length = float(np.linalg.norm(way))
     way = way / length if length > 0 else np.cross(normal, [0.0, 0.0, 1.0])
     near, far = -length, float(np.linalg.norm(body.body.size) + np.linalg.norm(other.body.size))
-    while far - near > _CONTACT:
+    while far - near > 2e-4:
         middle = 0.5 * (near + far)
         near, far = (middle, far) if body.move(middle * way).overlaps(other) else (near, middle)
     return body.move(far * way)

@@ -27,10 +27,8 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
 
-_SHARP = 0.02
 _MARGIN = (0.02, 0.12)
 """Metres of free board around all objects."""
-_TRIES = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,7 @@ class _Place:
         """Return a box between two corners, relative to the middle."""
         below, above = np.array(low), np.array(high)
         centre = self.middle + self.axes @ (below + above) / 2
-        return Superquadric((above - below) / 2, np.full(2, _SHARP), centre, quaternions.from_matrix(self.axes))
+        return Superquadric((above - below) / 2, np.full(2, 0.02), centre, quaternions.from_matrix(self.axes))
 
     def walls(self, height: float, thick: float) -> list[Superquadric]:
         x, y = self.half
@@ -157,7 +155,7 @@ def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TA
         If the objects do not fit into the camera's image, or the furniture always hides all of them.
     """
     kind = _KINDS[name]
-    for _ in range(_TRIES):
+    for _ in range(20):
         scene = things_on_table(rng, int(rng.integers(1, kind.most + 1)), camera, kind.elevation)
         seen = _furnish(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng), kind.is_thing)
         if seen.placed:

@@ -19,13 +19,6 @@ from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.things_on_table import ThingsOnTable
 
 _TURN = float(np.deg2rad(70.0))
-_BEHIND = (0.03, 0.4)
-"""Distance of the edge, metres, behind the farthest reading of an object."""
-_BELOW = (0.05, 0.9)
-_MOST = 10
-_HALF_SIZES = (0.02, 0.5)
-"""Drawn by their logarithms."""
-_SHAPES = (0.1, 1.0)
 
 
 def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
@@ -37,17 +30,17 @@ def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
     if not rows.size:
         return scene.depth
     farthest = (camera.unproject(columns, rows, scene.depth[rows, columns]) @ away).max()
-    edge = farthest + rng.uniform(*_BEHIND)
+    edge = farthest + rng.uniform(0.03, 0.4)
     table = plane_depth(scene.plane, camera)
     v, u = np.nonzero(np.isfinite(table))
     on_table = np.zeros(table.shape, bool)
     on_table[v, u] = camera.unproject(u, v, table[v, u]) @ away < edge
-    floor = np.append(normal, scene.plane[3] + rng.uniform(*_BELOW))
+    floor = np.append(normal, scene.plane[3] + rng.uniform(0.05, 0.9))
     ground = plane_depth(floor, camera)
     free = np.nonzero((scene.labels == 0) & ~on_table & np.isfinite(ground))
     if not free[0].size:
         return scene.depth
-    chosen = rng.integers(free[0].size, size=int(rng.integers(1, _MOST + 1)))
+    chosen = rng.integers(free[0].size, size=int(rng.integers(1, 11)))
     feet = camera.unproject(free[1][chosen], free[0][chosen], ground[free][chosen])
     standing = Superquadric.stack([_standing_at(foot, edge, away, scene.table, rng) for foot in feet])
     seen = np.minimum(np.minimum(ground, raycast.render(standing, camera)[0]), scene.wall)
@@ -58,8 +51,8 @@ def _standing_at(
     foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
 ) -> Superquadric:
     """Return a body on the floor below a point, moved from the table if it would reach under its top."""
-    least, most = np.log(_HALF_SIZES)
+    least, most = np.log((0.02, 0.5))
     size, turn = np.exp(rng.uniform(least, most, 3)), turn_about_up(rng.uniform(0, np.pi))
     clear = foot @ away - edge - np.hypot(*size[:2])
     centre = foot - min(clear, 0.0) * away + size[2] * table[:, 2]
-    return Superquadric(size, rng.uniform(*_SHAPES, 2), centre, quaternions.from_matrix(table @ turn))
+    return Superquadric(size, rng.uniform(0.1, 1.0, 2), centre, quaternions.from_matrix(table @ turn))

@@ -24,7 +24,7 @@ THINGS = {
 }
 """Full edges, exponents, place on the table and turn of each object."""
 SENSOR = "realsense_d435"
-_DISTANCE, _PITCH = 0.85, np.deg2rad(35.0)
+_PITCH = np.deg2rad(35.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ def sample(seed: int = 0) -> Sample:
     up = np.array([0.0, -np.cos(_PITCH), -np.sin(_PITCH)])
     right = np.array([1.0, 0.0, 0.0])
     table = np.stack([right, np.cross(up, right), up], axis=1)
-    looked_at = np.array([0.0, 0.0, _DISTANCE])
+    looked_at = np.array([0.0, 0.0, 0.85])
     bodies = []
     for edges, shape, place, degrees in THINGS.values():
         size = 0.5 * np.array(edges)

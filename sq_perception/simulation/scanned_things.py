@@ -21,10 +21,6 @@ from sq_perception.simulation.thing import NO_CAVITY, Rest, Thing
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
 LARGEST, SMALLEST = 1.0, 0.005
 """Longest edge of the box around an object, metres: others are taken for other units."""
-_POINT = 1e-5
-"""Half size of a superquadric that stands for a point, metres."""
-_USUAL = 0.99
-"""Share of the falls whose poses are kept, the likeliest first: each of a finely divided round side is unlikely."""
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
@@ -61,9 +57,10 @@ def _read(path: Path) -> Thing:
     middle = hull.bounds.mean(axis=0)
     corners = hull.vertices - middle
     points = np.zeros((len(corners), 12))
-    points[:, :3], points[:, 3:5], points[:, 5:8], points[:, 11] = _POINT, 1.0, corners, 1.0
+    points[:, :3], points[:, 3:5], points[:, 5:8], points[:, 11] = 1e-5, 1.0, corners, 1.0
     order = np.argsort(-likely, kind="stable")
-    kept = order[: np.searchsorted(np.cumsum(likely[order]), _USUAL * likely.sum()) + 1]
+    # The likeliest are kept: each pose of a finely divided round side is unlikely.
+    kept = order[: np.searchsorted(np.cumsum(likely[order]), 0.99 * likely.sum()) + 1]
     turns, likely = turns[kept], likely[kept]
     rests = tuple(
         Rest(f"face {k}", quaternions.from_matrix(turn[:3, :3]), float(share))

@@ -30,24 +30,11 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
 
 THESIS_SIZE = (25 / 255, 75 / 255)
-THESIS_SHAPE = (0.1, 1.0)
-THESIS_CENTRE = (88 / 255, 168 / 255)
 
 TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 MAX_TABLE_BODIES = 10
 
-_TABLE_SIZE = (0.02, 0.07)
-_TABLE_SHAPE = (0.1, 1.0)
-_DISTANCE = (0.7, 1.0)
-_PITCH = tuple(np.deg2rad([30.0, 60.0]))
 _ROLL = float(np.deg2rad(5.0))
-_PLACE_RADIUS = 0.3
-_GAP = 0.015
-_FLAT_BELOW = 0.5
-_ATTEMPTS = 2000
-_VIEWS = 10
-"""Number of views of the table that are tried: in one of seven, ten bodies do not fit."""
-_FARTHEST = 4.0
 
 
 @dataclass(frozen=True)
@@ -81,8 +68,8 @@ def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
     """Draw a batch (count,) of bodies of the thesis' protocol, in the cube frame."""
     return Superquadric(
         rng.uniform(*THESIS_SIZE, (count, 3)),
-        rng.uniform(*THESIS_SHAPE, (count, 2)),
-        rng.uniform(*THESIS_CENTRE, (count, 3)),
+        rng.uniform(0.1, 1.0, (count, 2)),
+        rng.uniform(88 / 255, 168 / 255, (count, 3)),
         quaternions.random(count, rng),
     )
 
@@ -104,14 +91,15 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
         raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
-    for _ in range(_VIEWS):
-        plane = table_plane(rng, _DISTANCE, _PITCH)
+    # In one of seven views ten bodies do not fit.
+    for _ in range(10):
+        plane = table_plane(rng, (0.7, 1.0), np.deg2rad((30.0, 60.0)))
         bodies: list[Superquadric] = []
         reach: list[float] = []
-        for _ in range(_ATTEMPTS):
+        for _ in range(2000):
             body, radius = resting_body(rng, plane)
             apart = all(
-                np.linalg.norm(body.translation - other.translation) > radius + other_radius + _GAP
+                np.linalg.norm(body.translation - other.translation) > radius + other_radius + 0.015
                 for other, other_radius in zip(bodies, reach, strict=True)
             )
             if apart and inside_image(body, camera):
@@ -131,7 +119,7 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
     slope = direction @ plane[:3]
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = -(origin @ plane[:3] + plane[3]) / slope
-    return np.where((slope < 0) & (depth > 0) & (depth < _FARTHEST), depth, np.inf)
+    return np.where((slope < 0) & (depth > 0) & (depth < 4.0), depth, np.inf)
 
 
 def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
@@ -148,12 +136,12 @@ def turn_about_up(yaw: float) -> np.ndarray:
 
 
 def resting_body(
-    rng: np.random.Generator, plane: np.ndarray, reach: float = _PLACE_RADIUS
+    rng: np.random.Generator, plane: np.ndarray, reach: float = 0.3
 ) -> tuple[Superquadric, float]:
     """Draw a body on the plane within ``reach`` metres of where the camera looks, and its bounding radius, metres."""
     normal, offset = plane[:3], plane[3]
-    size, shape = rng.uniform(*_TABLE_SIZE, 3), rng.uniform(*_TABLE_SHAPE, 2)
-    upright = int(rng.integers(3)) if shape.max() < _FLAT_BELOW else int(np.argmin(size))
+    size, shape = rng.uniform(0.02, 0.07, 3), rng.uniform(0.1, 1.0, 2)
+    upright = int(rng.integers(3)) if shape.max() < 0.5 else int(np.argmin(size))
     across = np.cross(normal, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     table = np.stack([across, np.cross(normal, across), normal], axis=1)

@@ -32,39 +32,12 @@ from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_tab
 
 NO, YES, UNKNOWN = 0, 1, 2
 _SENSORS = ("realsense_d435", "kinect_v1", "realsense_d435", "kinect_v1", "azure_kinect", "zed")
-_ANY_SENSOR = 0.35
-"""Share of the scenes that a sensor of random parameters measures, in place of one of those."""
-_FOCALS = (430.0, 700.0)
-"""Pixels, at VGA: depth cameras, 49 to 73 degrees wide."""
-_WIDTHS, _OF_WIDTHS = (160, 320, 640, 1280), (0.1, 0.1, 0.65, 0.15)
+_WIDTHS = (160, 320, 640, 1280)
 """Pixels per row, and the share of scenes of each."""
 _ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0.65, 0.15)
 """Degrees that the camera is above the table, and shares of the scenes."""
-_CROWDS, _IN_FURNITURE = 0.2, 0.3
-"""Shares of the scenes; they choose how high their cameras are."""
-_WITH_ROOM = 0.6
-"""Share of the other scenes whose table ends in sight, before a room."""
-_LARGER, _TIMES = 0.35, (1.0, 2.5)
-"""Share of the scenes that are as if all of it were so many times as large and as far: the largest object that is
-recovered is 0.6 m long, and what is none is not told by its size."""
-_SMALLER, _SIDES = 0.6, (0.35, 0.9)
-"""Share of the scenes of which a smaller image is taken, and its sides in those of the whole one."""
-_OFF, _OFF_SHARE = 0.01, 0.01
-"""Metres, and share of the depth: by less than their sum a reading is off that counts as one of what it shows."""
-_MOSTLY_NOTHING, _SOME_THING = 0.5, 0.3
-"""Shares of a segment's pixels: it has no object if the first share shows none and at most the second shows one."""
-_LEAST_CELLS = 8
-"""Measured cells of a segment: views with fewer are left out."""
 _SMEARED, _NO_OBJECT = -1, -2
 """In place of an object's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
-_PIECES = (3, 7)
-"""Pieces that a segment is cut into: from, and below."""
-_PURE = 0.7
-"""Share of a piece's readings that show one object: others have no object."""
-_PART = 0.1
-"""Share of a segment from which on what shows one of several objects is seen by itself as well."""
-_TWO_AS_ONE, _BESIDE = 0.3, np.ones((7, 7), np.uint8)
-"""Share of the segments that are seen as one with a neighbour within three pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +61,7 @@ def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
     images, truth = [], []
     for _ in range(scenes):
         for image, own in _views(_measure(rng), rng):
-            if np.count_nonzero(image[..., segment_view.MEASURED] * image[..., segment_view.SEGMENT]) >= _LEAST_CELLS:
+            if np.count_nonzero(image[..., segment_view.MEASURED] * image[..., segment_view.SEGMENT]) >= 8:
                 images.append(image.astype(np.float16))
                 truth.append(own)
     size = segment_view.PIXELS
@@ -115,16 +88,17 @@ class _Measured:
         """Return what the cells (p, p) of a view show, labels or ``_SMEARED``, and whether they have a reading."""
         height, width = self.depth.shape
         grid = np.ix_(np.clip(view.rows, 0, height - 1), np.clip(view.columns, 0, width - 1))
-        near = np.abs(self.depth[grid] - self.true_depth[grid]) < _OFF + _OFF_SHARE * self.depth[grid]
+        near = np.abs(self.depth[grid] - self.true_depth[grid]) < 0.01 + 0.01 * self.depth[grid]
         return np.where(near, self.shown[grid], _SMEARED), view.image[..., segment_view.MEASURED] > 0
 
 
 def _measure(rng: np.random.Generator) -> _Measured:
     """Draw a random image."""
     true_depth, shown, camera = _scene(rng)
-    if rng.random() < _LARGER:
-        true_depth = rng.uniform(*_TIMES) * true_depth
-    if rng.random() < _ANY_SENSOR:
+    # As if all of it were larger and as much farther away: a large object is not refused for its size.
+    if rng.random() < 0.35:
+        true_depth = rng.uniform(1.0, 2.5) * true_depth
+    if rng.random() < 0.35:
         depth = thing_sensing.measure_by_any(true_depth, shown > 0, camera, Stages(), rng)
     else:
         depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(true_depth, camera, rng)
@@ -137,15 +111,15 @@ def _measure(rng: np.random.Generator) -> _Measured:
 def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Draw the true depth (height, width), +inf for no surface, and labels of a random scene."""
     camera, kind = _camera(rng), rng.random()
-    if kind < _CROWDS:
+    if kind < 0.2:
         depth, shown = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
         return np.where(np.isnan(depth), np.inf, depth), shown, camera
-    if kind < _CROWDS + _IN_FURNITURE:
+    if kind < 0.5:
         drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)
         return drawn.depth, drawn.labels, camera
     elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
     drawn = things_on_table(rng, camera=camera, elevation=elevation)
-    return room.behind(drawn, rng) if rng.random() < _WITH_ROOM else drawn.depth, drawn.labels, camera
+    return room.behind(drawn, rng) if rng.random() < 0.6 else drawn.depth, drawn.labels, camera
 
 
 def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -165,15 +139,16 @@ def _of_merged(
     """Return images and truth of each object in a merged segment, and of pieces of it joined to a neighbour."""
     mask = found.labels == label
     counts = np.bincount(measured.shown[mask], minlength=1)
-    things = np.flatnonzero(counts[1:] > _PART * counts.sum()) + 1
+    things = np.flatnonzero(counts[1:] > 0.1 * counts.sum()) + 1
     for thing in things if len(things) > 1 else ():
         free = int(found.labels.max()) + 1
         parts = np.where(mask & (measured.shown == thing), np.int32(free), found.labels)
         view = measured.view(parts, free, found.plane)
         yield view.image, _truth(*measured.in_cells(view), int(thing))
-    others = np.unique(found.labels[cv2.dilate(mask.view(np.uint8), _BESIDE) > 0])
+    # Neighbours are within three pixels.
+    others = np.unique(found.labels[cv2.dilate(mask.view(np.uint8), np.ones((7, 7), np.uint8)) > 0])
     others = others[others > label]
-    if len(others) and rng.random() < _TWO_AS_ONE:
+    if len(others) and rng.random() < 0.3:
         both = np.where(found.labels == rng.choice(others), np.int32(label), found.labels)
         yield from _of_pieces(measured.view(both, label, found.plane), measured, rng)
 
@@ -185,12 +160,12 @@ def _of_pieces(
     cells, known = measured.in_cells(view)
     segment = view.image[..., segment_view.SEGMENT] > 0
     some, of = [], []
-    count, (row, column) = int(rng.integers(*_PIECES)), rng.uniform(0, segment_view.PIXELS, 2)
+    count, (row, column) = int(rng.integers(3, 7)), rng.uniform(0, segment_view.PIXELS, 2)
     numbers = pieces.compact(segment, count, (row, column))
     for number in range(numbers.max() + 1):
         piece = numbers == number
         counts = np.bincount(cells[piece & known & (cells >= 0)], minlength=1)
-        if counts.max() >= max(1, _PURE * np.count_nonzero(piece & known)):
+        if counts.max() >= max(1, 0.7 * np.count_nonzero(piece & known)):
             some.append(piece)
             of.append(int(counts.argmax()))
     for k in range(len(some)) if len(set(of)) > 1 else rng.permutation(len(some))[:1]:
@@ -198,18 +173,19 @@ def _of_pieces(
 
 
 def _camera(rng: np.random.Generator) -> Camera:
-    width = int(rng.choice(_WIDTHS, p=_OF_WIDTHS))
+    width = int(rng.choice(_WIDTHS, p=(0.1, 0.1, 0.65, 0.15)))
     height = width * (9 if width == _WIDTHS[-1] else 12) // 16
-    focal = (rng.uniform(*_FOCALS) if rng.random() < 0.5 else TABLE_CAMERA.fx) * width / TABLE_CAMERA.width
+    # Focal lengths at VGA of depth cameras, 49 to 73 degrees wide.
+    focal = (rng.uniform(430.0, 700.0) if rng.random() < 0.5 else TABLE_CAMERA.fx) * width / TABLE_CAMERA.width
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
     """Return a window of the image; some are small, at or beside an object, so that their borders cut objects."""
     height, width = shown.shape
-    if rng.random() >= _SMALLER:
+    if rng.random() >= 0.6:
         return slice(0, height), slice(0, width)
-    size = np.rint(rng.uniform(*_SIDES) * np.array([height, width])).astype(int)
+    size = np.rint(rng.uniform(0.35, 0.9) * np.array([height, width])).astype(int)
     things = np.unique(shown[shown > 0])
     middle = np.mean(np.nonzero(shown == rng.choice(things)), axis=1) if len(things) else 0.5 * size
     first = np.rint(middle + (rng.uniform(-0.5, 0.5, 2) - 0.5) * size).astype(int)
@@ -221,7 +197,7 @@ def _object(shown: np.ndarray) -> int:
     """Return the object that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
     counts = np.bincount(shown, minlength=2)
     most, total = int(counts[1:].argmax()) + 1, counts.sum()
-    has_none = counts[0] >= _MOSTLY_NOTHING * total and counts[most] <= _SOME_THING * total
+    has_none = counts[0] >= 0.5 * total and counts[most] <= 0.3 * total
     return _NO_OBJECT if has_none else most
 
 

@@ -22,9 +22,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, support_of_union
 from sq_perception.simulation.rendering import Mesh
 
-_STRAIGHT = (0.0, 0.0, 0.0, 1.0)
-_LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))
-
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
 """The object's x axis points up: it lies on a side."""
@@ -98,7 +95,7 @@ class Thing:
         rest = self.rests[one_of([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
         if rng.random() < leaning:
-            tilt, way = rng.uniform(*_LEAN), rng.uniform(0, 2 * np.pi)
+            tilt, way = rng.uniform(*np.deg2rad((4.0, 35.0))), rng.uniform(0, 2 * np.pi)
             name, turn = "leaning", quaternions.multiply(_turn(np.cos(way), np.sin(way), 0.0, tilt), turn)
         return name, quaternions.multiply(_turn(0.0, 0.0, 1.0, rng.uniform(0, 2 * np.pi)), turn)
 
@@ -118,7 +115,7 @@ def part(
     size: Numbers,
     shape: Numbers,
     at: Numbers = (0.0, 0.0, 0.0),
-    turn: Numbers = _STRAIGHT,
+    turn: Numbers = (0.0, 0.0, 0.0, 1.0),
 ) -> Row:
     """Return a superquadric of half sizes, exponents, centre, quaternion."""
     return (*size, *shape, *at, *turn)

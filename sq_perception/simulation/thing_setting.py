@@ -20,24 +20,12 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
-ON_TOP, FREE = 0.15, 0.05
-"""Shares of the views in which the object stands on something on the table, and in which there is no table."""
 _ELEVATIONS, _OFTEN = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0)), (0.55, 0.25, 0.2)
 """Degrees, and shares of the views.  Chosen: of a network that saw 0.5 % from above 80 degrees the hulls there erred
 half as much again as those at 20 to 70."""
-_DISTANCE = (0.35, 1.3, 2.0)
-_FARTHEST = 12.0
-"""Diagonals of its box, more than which no object is away."""
-_NEAREST = 0.05
-"""Metres before the camera that no object comes nearer than: long ones are farther away."""
-_FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
-"""Pixels: depth cameras at VGA to HD."""
 _PIXELS_ACROSS = (15.0, 80.0)
-_OFF_AXIS = (0.5, 0.4)
 _BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 _LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
-_AROUND = 0.7
-"""Half of the image's side over the object's width."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +90,13 @@ class Setting:
 
 def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     """Draw a random pose of the object before a random camera; see the module."""
-    free = rng.random() < FREE
+    free = rng.random() < 0.05
     turn = quaternions.random(1, rng)[0] if free else thing.pose(rng)[1]
     parts = move(thing.parts.to_flat(), turn, np.zeros(3))
     reach = flat_support(parts, SIX_WAYS)
     others, floor = [], 0.0
     if not free:
-        if rng.random() < ON_TOP:
+        if rng.random() < 0.15:
             floor = -rng.uniform(0.02, 0.2)
             others.append(_stand(reach, floor, rng))
         others = _with_neighbours(others, parts, floor, rng)
@@ -145,17 +133,18 @@ def _camera_pose(
     """
     elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
-    aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
+    aside, below = rng.uniform(-1, 1, 2) * (0.5, 0.4)
     ray = np.array([aside, below, 1.0])
     look = looking_down(_pitch(ray, elevation, roll), roll)
     matrix = quaternions.to_matrix(look)
-    near, usual, far = _DISTANCE
+    near, usual, far = 0.35, 1.3, 2.0
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
-    distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
+    distance = min(distance, 12.0 * float(np.linalg.norm(reach[:3] + reach[3:])))
     middle = 0.5 * (reach[:3] - reach[3:])
     towards = -matrix[2]
     before = float(flat_support(parts, towards[None])[0] - towards @ middle)
-    distance = max(distance, (before + _NEAREST) * float(np.linalg.norm(ray)))
+    # Long objects are farther away: none comes nearer than 5 cm to the camera.
+    distance = max(distance, (before + 0.05) * float(np.linalg.norm(ray)))
     return look, distance * ray / np.linalg.norm(ray) - matrix @ (lift + middle), distance
 
 
@@ -181,10 +170,11 @@ def _camera(parts: np.ndarray, rng: np.random.Generator) -> Camera:
     right, down, _, left, up, _ = flat_support(parts, SIX_WAYS)
     z = float(parts[:, 7].mean())
     width = max(right + left, down + up)
-    focal = rng.choice(_FOCALS) * rng.uniform(0.9, 1.1)
+    # Depth cameras at VGA to HD.
+    focal = rng.choice((425.0, 525.0, 580.0, 615.0, 700.0, 920.0)) * rng.uniform(0.9, 1.1)
     across = min(max(focal * width / z, _PIXELS_ACROSS[0]), rng.uniform(*_PIXELS_ACROSS))
     focal = across * z / width
-    half = int(np.ceil(_AROUND * across)) + 4
+    half = int(np.ceil(0.7 * across)) + 4
     u, v = focal * 0.5 * (right - left) / z, focal * 0.5 * (down - up) / z
     return Camera(2 * half, 2 * half, focal, focal, half - u, half - v)
 

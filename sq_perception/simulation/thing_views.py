@@ -36,8 +36,6 @@ from sq_perception.simulation.thing import Thing
 from sq_perception.simulation.thing_sensing import measure_by_any
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 
-OWN = 0.5
-"""Share of the views that show one's own objects, where there are such."""
 PLANE_GIVEN, TOP_GIVEN = 0.8, 2 / 3
 """Shares of the views with a plane, and of those of an object on top of something in which it is that top, as often as
 :mod:`sq_perception.recovery.supports` finds it.  Else the object hovers above its plane, and a network that often sees
@@ -45,13 +43,9 @@ that expects it of objects whose lower end is hidden."""
 BEFORE, MOST_BEFORE = 0.25, 0.6
 """Share of the views with something nearer before the object, and the most of the object that it hides.  Chosen: of the
 objects of household scenes a quarter are hidden by a tenth and more."""
-UNREAD = 0.5
-"""Share of the views whose mask covers pixels without a reading: masks from colour do, those from depth do not."""
 LOST, MOST_LOST = 0.08, 0.3
 """Share of the views whose mask has lost what lies beyond a straight line, and the most of the object that it loses.
 Of objects of household scenes that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation."""
-PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
-"""Standard deviations of the given plane: of its tilt in both directions, and of its distance from the object."""
 
 _MASK_ERRORS = (-2, -1, 0, 0, 0, 0, 0, 1, 1, 2)
 """Pixels by which masks are too large, each as often.  Few are too small, as those that are all around are completed
@@ -60,10 +54,8 @@ looks like them."""
 _PIXELS = 64
 """Side of the views: what the network of objects takes."""
 _LEAST_SEEN = 40
-_LARGEST_SUPPORT, _LEAST_WIDTH = 3.0, 0.6
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
 _ATTEMPTS = 50
-_ON_TABLE = 0.003
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +104,7 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
 def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
     """Draw an object, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
-        thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng)
+        thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < 0.5 else draw_thing(rng)
         setting = draw_setting(thing, rng)
         stages = draw_stages(rng)
         measured, seen, camera = _measure(setting, stages, rng)
@@ -125,14 +117,15 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         mask = _mask(measured, seen, camera, setting.table if plane is None else plane, rng)
         if rng.random() < LOST:
             mask = _partly(mask, rng)
-        if rng.random() >= UNREAD:
+        # Masks from depth end where nothing was measured, those from colour do not.
+        if rng.random() >= 0.5:
             mask = mask & np.isfinite(measured)
         measured, mask, camera = _cut(measured, mask, camera, rng)
         if np.count_nonzero(mask & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         view = canonical_view.from_mask(measured, mask, camera, _PIXELS, plane=plane, missing_is_hidden=True)
         reach = support_in_view(setting.parts, view)
-        if np.abs(reach).max() > _LARGEST_SUPPORT or (reach + reach[_OPPOSITE]).max() < _LEAST_WIDTH:
+        if np.abs(reach).max() > 3.0 or (reach + reach[_OPPOSITE]).max() < 0.6:
             continue
         return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
@@ -183,10 +176,10 @@ def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Genera
 
 def _imprecise(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the plane as it would be found: tilted about the point below ``at`` and shifted."""
-    normal = plane[:3] + PLANE_TILT * rng.standard_normal(3)
+    normal = plane[:3] + np.deg2rad(0.7) * rng.standard_normal(3)
     normal /= np.linalg.norm(normal)
     foot = at - (plane[:3] @ at + plane[3]) * plane[:3]
-    return np.append(normal, -(normal @ foot) + rng.normal(0, PLANE_SHIFT))
+    return np.append(normal, -(normal @ foot) + rng.normal(0, 0.002))
 
 
 def _mask(
@@ -206,7 +199,7 @@ def _mask(
         points = camera.unproject(columns, rows, measured[rows, columns])
         above = inner.copy()
         # A pixel without a reading stays: its comparison is False.
-        above[rows, columns] = ~(points @ table[:3] + table[3] <= _ON_TABLE)
+        above[rows, columns] = ~(points @ table[:3] + table[3] <= 0.003)
         inner = above if 2 * np.count_nonzero(above) > rows.size else inner
     footprint = float(np.median(measured[seen][np.isfinite(measured[seen])], axis=0)) / camera.fx
     return coherent(measured, inner, shown_step(footprint))

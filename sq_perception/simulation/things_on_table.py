@@ -36,20 +36,11 @@ MOST_THINGS = 8
 TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
 """VGA, 60 degrees wide."""
 
-_DISTANCE = (0.5, 1.2)
 ELEVATION = (20.0, 70.0)
 """Degrees."""
 _ROLL = float(np.deg2rad(5.0))
-_WALL = (1.8, 3.5)
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many an object can neither lean nor be stacked where it is tried."""
-_GAP = 0.003
-_ALONG = 1e-6
-"""Component of a unit vector: what comes no nearer than this to a plane moves along it."""
-_LEAN = tuple(np.deg2rad([8.0, 35.0]))
-_NEAREST = 0.35
-_TRIES = 60
-_SCENES = 15
 _MARGIN = 2.0
 _UP, _DOWN = 128, 129
 """The last of the directions that follow; of those before, opposite ones are half as far apart."""
@@ -138,7 +129,7 @@ class _Resting:
     def push(self, way: np.ndarray, other: _Resting) -> _Resting | None:
         """Push along the level ``way``, from before the other one, until it touches; None if it passes by."""
         gap, closing = -(other.reach + self.reach[_BACK])[:_UP], -(_WAYS[:_UP] @ way)
-        comes = closing > _ALONG
+        comes = closing > 1e-6
         ends = (gap[comes] / closing[comes]).max()
         nearest = int(np.argmax(_WAYS[:_UP] @ way))
         if (gap[~comes] >= 0).any() or ends > other.reach[nearest] + other.reach[_BACK[nearest]]:
@@ -167,9 +158,9 @@ def things_on_table(
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     wanted = int(rng.integers(1, MOST_THINGS + 1)) if count is None else count
-    for _ in range(_SCENES):
+    for _ in range(15):
         look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
-        eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
+        eye = np.array([0.0, 0.0, rng.uniform(0.5, 1.2)])
         resting = _arrange(wanted, look, eye, camera, rng, kinds)
         if resting is not None:
             return _seen(resting, look, eye, camera, rng)
@@ -187,13 +178,13 @@ def _arrange(
     resting: list[_Resting] = []
     spread = rng.uniform(0.08, 0.3)
     failed = 0
-    while failed < _TRIES:
+    while failed < 60:
         failed += 1
         how = str(rng.choice(_HOW)) if resting else "apart"
         placed = _draw(draw_thing(rng, kinds), how, resting, spread, rng)
         if placed is None or not _in_view(placed, look, eye, camera):
             continue
-        if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):
+        if all(placed.apart(other, 0.003 if how == "apart" else -1e-6) for other in resting):
             resting.append(placed)
             failed = 0
         if len(resting) == count:
@@ -208,7 +199,7 @@ def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np
     way = np.array([np.cos(bearing), np.sin(bearing), 0.0])
     if how == "leaning":
         # Tilted about a level axis, so that the upper end goes towards ``way``.
-        half = 0.5 * rng.uniform(*_LEAN)
+        half = 0.5 * rng.uniform(*np.deg2rad((8.0, 35.0)))
         tilt = np.array([-way[1] * np.sin(half), way[0] * np.sin(half), 0.0, np.cos(half)])
         turn = quaternions.multiply(tilt, turn)
     flat_top = thing.kind == "box" or (thing.kind == "can" and rest == "standing" and len(thing.parts) == 1)
@@ -245,7 +236,7 @@ def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np
 def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) -> bool:
     parts = move(move(body.thing.parts.to_flat(), body.turn, body.shift), look, eye)
     reach = flat_support(parts, SIX_WAYS)
-    if -reach[5] < _NEAREST:
+    if -reach[5] < 0.35:
         return False
     corners = np.array([[x, y, -reach[5]] for x in (reach[0], -reach[3]) for y in (reach[1], -reach[4])])
     pixels = camera.project(corners)
@@ -264,7 +255,7 @@ def _seen(
     parts = [move(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
     holes = [move(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
     everything, cavities = (Superquadric.from_flat(np.concatenate(flat)) for flat in (parts, holes))
-    wall = rng.uniform(*_WALL)
+    wall = rng.uniform(1.8, 3.5)
     depth, index = render_things(everything, owner, cavities, whose, camera, plane, wall)
     placed = tuple(
         PlacedThing(body.thing, body.rest, *pose, k + 1, int(np.count_nonzero(index == k)))

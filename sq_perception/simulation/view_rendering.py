@@ -21,9 +21,6 @@ from sq_perception.imaging.canonical_view import HIDDEN, MARGIN, NEAREST, OUTLIE
 
 _NOTHING, _BEHIND = -1e300, -2e300
 """In place of the z that a ray meets: it meets no surface, or an occluder before it could."""
-_MOST_ROUNDS = 4
-"""Rounds of fitting a view to what it shows; where there is an occluder, the first one finds where that begins."""
-_SAME_EXTENT = 0.005
 _Sensed: TypeAlias = tuple[bool, float, float]
 """Whether a pinhole camera sees, its eye's z, and the step of depths, 0 for none."""
 _Curtain: TypeAlias = tuple[float, float, float, float]
@@ -153,7 +150,8 @@ def _render_view(
     surface, reach = np.empty((pixels, pixels)), np.empty((pixels, pixels))
     is_occluded, is_missed = front[5] > 0.0, np.any(miss != 0.0)
     is_fitted = sensed[0] or is_occluded  # else all of the body's extent is seen, which is known
-    rounds, curtain = _MOST_ROUNDS, (anchor[0], anchor[1], side, np.inf)
+    # Where there is an occluder, the first round finds where that begins.
+    rounds, curtain = 4, (anchor[0], anchor[1], side, np.inf)
     if is_occluded:
         _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
         curtain = (anchor[0], anchor[1], side, _begins(surface, reach, front[5]))
@@ -169,7 +167,7 @@ def _render_view(
         extent = anchor[2] - seen[outliers]
         top, bottom, left, right = _limits(surface)
         extent = max(extent, max(bottom - top, right - left) * side / pixels if is_fitted else side / MARGIN)
-        done = abs(extent * MARGIN - side) <= (_SAME_EXTENT + 1.5 * is_fitted / pixels) * side
+        done = abs(extent * MARGIN - side) <= (0.005 + 1.5 * is_fitted / pixels) * side
         if done and not is_missed:
             break
         if is_fitted:
