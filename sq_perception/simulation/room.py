@@ -40,7 +40,7 @@ def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
     free = np.nonzero((scene.labels == 0) & ~on_table & np.isfinite(ground))
     if not free[0].size:
         return scene.depth
-    chosen = rng.integers(free[0].size, size=int(rng.integers(1, 10 + 1)))
+    chosen = rng.integers(free[0].size, size=int(rng.integers(1, 11)))
     feet = camera.unproject(free[1][chosen], free[0][chosen], ground[free][chosen])
     standing = Superquadric.stack([_standing_at(foot, edge, away, scene.table, rng) for foot in feet])
     seen = np.minimum(np.minimum(ground, raycast.render(standing, camera)[0]), scene.wall)

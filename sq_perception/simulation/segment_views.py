@@ -95,7 +95,7 @@ class _Measured:
 def _measure(rng: np.random.Generator) -> _Measured:
     """Draw a random image."""
     true_depth, shown, camera = _scene(rng)
-    # As if all of it were larger and as much farther away: the largest object that is recovered is 0.6 m long,
+    # As if all of it were larger and as much farther away: a large object is not refused for its size.
     if rng.random() < 0.35:
         true_depth = rng.uniform(1.0, 2.5) * true_depth
     if rng.random() < 0.35:
@@ -114,7 +114,7 @@ def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
     if kind < 0.2:
         depth, shown = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
         return np.where(np.isnan(depth), np.inf, depth), shown, camera
-    if kind < 0.2 + 0.3:
+    if kind < 0.5:
         drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)
         return drawn.depth, drawn.labels, camera
     elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
@@ -145,6 +145,7 @@ def _of_merged(
         parts = np.where(mask & (measured.shown == thing), np.int32(free), found.labels)
         view = measured.view(parts, free, found.plane)
         yield view.image, _truth(*measured.in_cells(view), int(thing))
+    # Neighbours are within three pixels.
     others = np.unique(found.labels[cv2.dilate(mask.view(np.uint8), np.ones((7, 7), np.uint8)) > 0])
     others = others[others > label]
     if len(others) and rng.random() < 0.3:

@@ -22,7 +22,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, support_of_union
 from sq_perception.simulation.rendering import Mesh
 
-
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
 ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
 """The object's x axis points up: it lies on a side."""

@@ -137,7 +137,7 @@ def _camera_pose(
     ray = np.array([aside, below, 1.0])
     look = looking_down(_pitch(ray, elevation, roll), roll)
     matrix = quaternions.to_matrix(look)
-    near, usual, far = (0.35, 1.3, 2.0)
+    near, usual, far = 0.35, 1.3, 2.0
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
     distance = min(distance, 12.0 * float(np.linalg.norm(reach[:3] + reach[3:])))
     middle = 0.5 * (reach[:3] - reach[3:])

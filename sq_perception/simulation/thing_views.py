@@ -54,6 +54,7 @@ looks like them."""
 _PIXELS = 64
 """Side of the views: what the network of objects takes."""
 _LEAST_SEEN = 40
+_OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
 _ATTEMPTS = 50
 
 
@@ -124,7 +125,7 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
             continue
         view = canonical_view.from_mask(measured, mask, camera, _PIXELS, plane=plane, missing_is_hidden=True)
         reach = support_in_view(setting.parts, view)
-        if np.abs(reach).max() > 3.0 or (reach + reach[np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)]).max() < 0.6:
+        if np.abs(reach).max() > 3.0 or (reach + reach[_OPPOSITE]).max() < 0.6:
             continue
         return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
