@@ -33,6 +33,8 @@ from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import (
     BASIN,
     COARSE,
+    SLACK,
+    STEPS,
     THING,
     Problem,
     Solution,
@@ -40,7 +42,7 @@ from sq_perception.fitting.multistart import (
     within_doubt,
 )
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.options import MODEL_ERROR, TAPER, FitOptions
+from sq_perception.fitting.options import MODEL_ERROR, TAPER, FitOptions, limits
 from sq_perception.fitting.rays import SAMPLE
 from sq_perception.fitting.residuals import mean_loss, surface_distance
 from sq_perception.geometry.quantiles import deviation
@@ -84,38 +86,33 @@ SPREAD = 2.5**2
 _AS_HULL = ("like the convex hull of the object",)
 
 
-def terms_of(observation: Observation, plane: np.ndarray | None) -> Terms:
-    """The terms of an object that is a superquadric, with those of the plane where one is known."""
+def problem_of(observation: Observation, options: FitOptions, deadline: float) -> Problem:
+    """The problem of an object as a superquadric, or as a thing where its observation knows a model error."""
+    plane, model_error, taper, hull = options.plane, observation.model_error, 0.0, None
     terms = Terms(
         hit_tolerance=_HIT_TOLERANCE,
         pinhole=1.0 if observation.camera.is_pinhole else 0.0,
         outline_stiffness=1 / observation.outline,
         proportion_stiffness=1 / _PROPORTION_SIGMA,
     )
-    if plane is None:
-        return terms
-    scale = min((observation.model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
-    return terms._replace(
-        plane=plane,
-        plane_stiffness=1 / (_PLANE_SIGMA * scale),
-        gap_stiffness=1 / (_GAP_SIGMA * scale),
-        rest_stiffness=1 / _REST_SIGMA,
-        volume_price=_VOLUME_PRICE,
-    )
-
-
-def problem_of(observation: Observation, options: FitOptions, deadline: float) -> Problem:
-    """The problem of an object as a superquadric, or as a thing where its observation knows a model error."""
-    terms = terms_of(observation, options.plane)
-    if not observation.model_error:
-        return Problem.of(observation, options, terms, deadline)
-    terms = terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY)
-    problem = Problem.of(observation.of_hull(), options, terms, deadline)
-    problem = replace(problem, independent=INDEPENDENT)
-    hull = options.predicted_hull()
-    if hull is None:
-        return problem.with_terms(volume_price=_VOLUME_PRICE, roundness_stiffness=1 / ROUND_SIGMA)
-    return replace(problem, hull=hull, terms=_beside(hull, terms)).within(taper=TAPER)
+    if plane is not None:
+        scale = min((model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
+        terms = terms._replace(
+            plane=plane,
+            plane_stiffness=1 / (_PLANE_SIGMA * scale),
+            gap_stiffness=1 / (_GAP_SIGMA * scale),
+            rest_stiffness=1 / _REST_SIGMA,
+            volume_price=_VOLUME_PRICE,
+        )
+    if model_error:
+        observation, hull = observation.of_hull(), options.predicted_hull()
+        terms = terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY)
+        if hull is None:
+            terms = terms._replace(volume_price=_VOLUME_PRICE, roundness_stiffness=1 / ROUND_SIGMA)
+        else:
+            taper, terms = TAPER, _beside(hull, terms)
+    independent = INDEPENDENT if model_error else None
+    return Problem(observation, options, terms, limits(observation.points, taper), deadline, independent, hull)
 
 
 def _beside(hull: HullPrior, terms: Terms) -> Terms:
@@ -168,7 +165,10 @@ def _on_all_rays(problem: Problem, finalists: Sequence[State]) -> Solution:
     few = problem.draw(enough // 4, 0.3)
     problem, favourite = outline.sharpened(problem, favourite, rays.free, few)
     settled = by_cost(problem.settle(state, few) for state in [favourite, *others])
-    return Solution(problem, problem.refined_best(settled, rays), rays)
+    # Few rays do not tell these apart.
+    near = [state for state in settled if state.cost <= settled[0].cost + SLACK]
+    refined = by_cost(problem.refine(state, rays) for state in (near[:1] if problem.late else near))
+    return Solution(problem, refined[0], rays)
 
 
 def _enough_rays(observation: Observation) -> int:
@@ -186,8 +186,7 @@ def _without_outliers(observation: Observation, hits: np.ndarray, state: State) 
 
 def thing(problem: Problem, starts: Sequence[State]) -> Solution:
     """The most probable body of a thing, its misfit estimated with it."""
-    straight = problem.within(taper=0.0)
-    settled = straight.search(starts, THING)
+    settled = problem.straight().search(starts, THING)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     drawn = problem
     if misfit > 1.0 and problem.hull is not None:
@@ -196,13 +195,14 @@ def thing(problem: Problem, starts: Sequence[State]) -> Solution:
         settled = settled if problem.late else drawn.search(settled, THING[1:])
     rays = drawn.draw(problem.options.pixels or SAMPLE, 0.3)
     spread = SPREAD if problem.hull is None else 1.0
-    solution = Solution(drawn, drawn.refined_best(settled, rays), rays, spread_factor=spread)
+    solution = Solution(drawn, drawn.settle(settled[0], rays, STEPS), rays, spread_factor=spread)
     solution = solution if problem.hull is None else _straight_unless_known(solution)
-    problem = replace(problem, limits=solution.problem.limits)
-    problem = problem.with_terms(taper_stiffness=solution.problem.terms.taper_stiffness)
+    terms = solution.problem.terms._replace(hull_root=problem.terms.hull_root)
+    problem = replace(solution.problem, independent=INDEPENDENT, terms=terms)
     left = _mean_loss(problem, solution.state)
     solution = replace(solution, problem=problem, rays=rays.weighing(1 / max(1.0, left / EXPLAINED)))
-    if left > _typical_of_hollow(problem):
+    # As far off as noise reaches at most: points of a bowl or a pair of pliers typically are.
+    if left > _HUBER * (2 * INLIER - _HUBER):
         solution = replace(solution, notes=_AS_HULL, as_hull=True)
     return solution
 
@@ -218,16 +218,11 @@ def _straight_unless_known(solution: Solution) -> Solution:
     known = taper @ np.linalg.solve(covariance, taper) + np.linalg.slogdet(covariance)[1]
     if known > 4 * math.log(TAPER_SIGMA) or problem.late:
         return solution
-    straight = problem.with_terms(taper_stiffness=0.0).within(taper=0.0)
-    return replace(solution, problem=straight, state=straight.refine(solution.state, solution.rays))
+    straight = problem.straight()
+    return replace(solution, problem=straight, state=straight.settle(solution.state, solution.rays, STEPS))
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
     """Mean loss of the object's rays: c of the module."""
     rays = problem.observation.object_rays(SAMPLE, 0.1)
     return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
-
-
-def _typical_of_hollow(problem: Problem) -> float:
-    """Huber's loss of a point as far off as noise reaches at most: a bowl's or a pair of pliers' typically have it."""
-    return problem.terms.huber * (2 * INLIER - problem.terms.huber)

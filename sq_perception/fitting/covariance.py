@@ -56,9 +56,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
     unknowns = len(prior) if terms.taper_stiffness == 0.0 else STEP_LENGTH
     prior = np.append(prior, np.zeros(STEP_LENGTH - len(prior)))  # that of the taper is among the terms
     freedom = math.inf if hull is None else float(hull.freedom)  # an int would have it compiled again
-    hits, free = rays.every(stride).weighing(stride)
-    others = terms._replace(hull_directions=terms.hull_directions[:0])
-    information = _information(hits, free, others, terms, state.parameters, state.rotation, prior, freedom)
+    information = _information(rays.hits, rays.free, stride, terms, state.parameters, state.rotation, prior, freedom)
     covariance = _inverse(information[:unknowns, :unknowns], float(prior[:11].min()))
     units = np.concatenate([state.parameters[:3], np.ones(unknowns - 3)])
     covariance = units[:, None] * covariance * units
@@ -70,7 +68,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
 def _information(
     hits: np.ndarray,
     free: np.ndarray,
-    others: Terms,
+    stride: int,
     terms: Terms,
     parameters: np.ndarray,
     rotation: np.ndarray,
@@ -79,19 +77,21 @@ def _information(
 ) -> np.ndarray:
     """The inverse (13, 13) of the covariance, with ``prior`` (13,) the diagonal of P and ``freedom`` nu.
 
-    ``others`` are the terms without the hull.
+    Each ``stride``-th ray counts for those between.
     """
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     of_hull = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    cost = evaluate(RENDERED, hits, free, others, parameters, rotation, hits[:, DEPTH].copy(), sums)
-    variance = max(1.0, cost / hits[:, WEIGHT].sum())
-    vaguer = 1.0
-    if terms.hull_directions.shape[0] > 0:
-        vaguer += hull_cost(terms, parameters, rotation, of_hull) / freedom
+    hits, free = hits[::stride].copy(), free[::stride].copy()
+    hits[:, WEIGHT] *= stride
+    free[:, WEIGHT] *= stride
+    cost = evaluate(RENDERED, hits, free, terms, parameters, rotation, hits[:, DEPTH].copy(), sums)
+    hull = hull_cost(terms, parameters, rotation, of_hull) if terms.hull_directions.shape[0] > 0 else 0.0
+    variance = max(1.0, (cost - hull) / hits[:, WEIGHT].sum())
+    vaguer = 1.0 + hull / freedom
     information = np.diag(prior)
     for j in range(STEP_LENGTH):
         for k in range(j + 1):
-            information[j, k] += sums[j, k] / variance + of_hull[j, k] / vaguer
+            information[j, k] += (sums[j, k] - of_hull[j, k]) / variance + of_hull[j, k] / vaguer
             information[k, j] = information[j, k]
     return information
 

@@ -29,7 +29,7 @@ from sq_perception.fitting.covariance import UNTAPERED, Alternative, covariance_
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.options import FitOptions, limits
+from sq_perception.fitting.options import FitOptions
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.geometry.superquadric import Superquadric
@@ -85,10 +85,10 @@ class Problem:
     independent
         Number of independent rays that the object counts as, however many are drawn, where errors of neighbouring
         pixels are alike; None where every ray counts as one.
-    expected
-        A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
     hull
         A prediction of the thing's hull, which weighs in through the terms.
+    expected
+        A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
     """
 
     observation: Observation
@@ -97,13 +97,8 @@ class Problem:
     limits: tuple[np.ndarray, np.ndarray]
     deadline: float
     independent: float | None = None
-    expected: Superquadric | None = None
     hull: HullPrior | None = None
-
-    @classmethod
-    def of(cls, observation: Observation, options: FitOptions, terms: Terms, deadline: float) -> Problem:
-        """The problem of a superquadric that leaves nothing but noise."""
-        return cls(observation, options, terms, limits(observation.points), deadline)
+    expected: Superquadric | None = None
 
     @property
     def late(self) -> bool:
@@ -120,11 +115,10 @@ class Problem:
         """The problem with some terms changed."""
         return replace(self, terms=self.terms._replace(**changed))
 
-    def within(self, taper: float) -> Problem:
-        """The problem with tapers up to a limit."""
-        lower, upper = (limit.copy() for limit in self.limits)
-        lower[8:], upper[8:] = -taper, taper
-        return replace(self, limits=(lower, upper))
+    def straight(self) -> Problem:
+        """The problem without tapers."""
+        lower, upper = (np.append(limit[:8], np.zeros(2)) for limit in self.limits)
+        return replace(self, limits=(lower, upper), terms=self.terms._replace(taper_stiffness=0.0))
 
     def without_hull(self) -> Problem:
         """The problem as if no hull had been predicted."""
@@ -175,15 +169,6 @@ class Problem:
     def refine(self, state: State, rays: Rays, steps: int = STEPS) -> State:
         """A body at the end of its valley."""
         return self._minimized(RENDERED, state, rays, steps, FINAL_TOLERANCE)
-
-    def refined_best(self, settled: Sequence[State], rays: Rays) -> State:
-        """The best body on these rays of the first ones of some, best first, that few rays do not tell apart."""
-        found = [self.refine(settled[0], rays)]
-        for state in settled[1:]:
-            if self.late or state.cost > settled[0].cost + SLACK:
-                break
-            found.append(self.refine(state, rays))
-        return by_cost(found)[0]
 
     def _minimized(self, residual: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
         return minimize(residual, *rays, self.terms_at(state), state, self.limits, steps, tolerance)

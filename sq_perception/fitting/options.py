@@ -29,14 +29,14 @@ MODEL_ERROR = 0.0025
 """How far real objects stray from superquadrics on tables of everyday things, metres."""
 
 
-def limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y for observed points (n, 3); without a taper."""
+def limits(points: np.ndarray, taper: float) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y for observed points (n, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent = max(float(np.linalg.norm(high - low)), 1e-9)
     smallest, largest = SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2
     reach = math.sqrt(3.0) * max(extent, largest)  # no point of a body is farther from its centre
-    lower = np.array([*[smallest] * 3, *[EXPONENTS[0]] * 2, *(low - reach), 0.0, 0.0])
-    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(high + reach), 0.0, 0.0])
+    lower = np.array([*[smallest] * 3, *[EXPONENTS[0]] * 2, *(low - reach), -taper, -taper])
+    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(high + reach), taper, taper])
     return lower, upper
 
 

@@ -239,7 +239,9 @@ def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution 
         if solution.problem.late or solution.misfit > course.EXPLAINS:
             break
         solution = step(solution)
-    return replace(solution, is_unfinished=solution.problem.late and solution.misfit > _UNFINISHED)
+    if solution.problem.late and solution.misfit > _UNFINISHED:
+        return replace(solution, is_unfinished=True)
+    return solution
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:

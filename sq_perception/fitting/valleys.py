@@ -111,6 +111,8 @@ def explored(solution: Solution) -> Solution:
         found.append(best)
         solution = replace(solution, state=better)
     others = [state for state in found if not alike(state, best)]
+    if not others:
+        return solution
     weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
     more = (Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))
     return replace(solution, alternatives=(*solution.alternatives, *more))
@@ -156,8 +158,10 @@ def weighed(solution: Solution) -> Solution:
     Of a thing each competes with bodies of which that size is like the other two, or thin.
     """
     problem, state, rays, expected = solution.problem, solution.state, solution.rays, solution.problem.options.expected
+    if problem.hull is not None or (expected is None and problem.independent is None):
+        return solution
     weak = [int(k) for k in np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))]
-    if not weak or problem.hull is not None or (expected is None and problem.independent is None):
+    if not weak:
         return solution
     rivals, notes = [state], solution.notes
     if problem.independent is not None:
@@ -173,7 +177,7 @@ def weighed(solution: Solution) -> Solution:
     few = problem.draw(SETTLE.rays, SETTLE.offset)
     few = few.weighing(rays.weight / few.weight)
     settled = by_cost(problem.settle(rival, few) for rival in rivals)
-    return replace(solution, problem=problem, state=problem.refined_best(settled, rays), notes=notes)
+    return replace(solution, problem=problem, state=problem.refine(settled[0], rays), notes=notes)
 
 
 def or_oval(solution: Solution) -> Solution:
