@@ -29,7 +29,7 @@ MODEL_ERROR = 0.0025
 """How far real objects stray from superquadrics on tables of everyday things, metres."""
 
 
-def limits(points: np.ndarray, taper: float) -> tuple[np.ndarray, np.ndarray]:
+def limits(points: np.ndarray, taper: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y for observed points (n, 3)."""
     low, high = points.min(axis=0), points.max(axis=0)
     extent = max(float(np.linalg.norm(high - low)), 1e-9)
