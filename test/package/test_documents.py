@@ -124,7 +124,8 @@ class Loads(HTMLParser):
             self.linked.append(str(values["href"]))
 
 
-def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
+def test_the_site_loads_nothing_from_elsewhere_and_links_to_files_that_are_there(site: Path) -> None:
+    """Links out of docs/, to benchmarks and sources, are turned to what the site carries of them."""
     pages = sorted(site.rglob("*.html"))
     assert len(pages) > 20
     for page in pages:
@@ -133,20 +134,11 @@ def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
         assert found.loaded
         outside = [one for one in found.loaded if re.match(r"(\w+:)?//", one)]
         assert not outside, page.name
-    for sheet in site.rglob("*.css"):
-        assert not re.search(r"url\(\s*[\"']?(https?:)?//", sheet.read_text(encoding="utf-8")), sheet.name
-
-
-def test_pages_link_to_files_that_are_there(site: Path) -> None:
-    """Links out of docs/, to benchmarks and sources, are turned to what the site carries of them."""
-    for page in sorted(site.rglob("*.html")):
         if page.name == "404.html":  # addressed from the root, wherever it is shown
             continue
-        found = Loads()
-        found.feed(page.read_text(encoding="utf-8"))
-        for address in (*found.loaded, *found.linked):
-            if re.match(r"\w+:|//|#", address):
-                continue
+        for address in (one for one in (*found.loaded, *found.linked) if not re.match(r"\w+:|//|#", one)):
             target = page.parent / address.partition("#")[0].partition("?")[0]
             assert target.exists(), f"{page.relative_to(site)}: {address}"
     assert (site / "repository/benchmarks/results/tracking.html").is_file()
+    for sheet in site.rglob("*.css"):
+        assert not re.search(r"url\(\s*[\"']?(https?:)?//", sheet.read_text(encoding="utf-8")), sheet.name

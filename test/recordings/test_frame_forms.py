@@ -53,7 +53,7 @@ def test_other_json_says_what_was_expected(tmp_path, content, said):
     ("name", "value", "dtype"),
     [
         *[("a.npy", 0.8, np.float32), ("a.npy", 0.8, ">f8"), ("a.npy", 800, np.uint16), ("a.npy", 800, ">u2")],
-        *[("a.tiff", 0.8, np.float32), ("a.tiff", 800, np.uint16)],
+        *[("a.tiff", 0.8, np.float32), ("a.tiff", 800, np.uint16), ("a.png", 800, np.uint16)],
     ],
 )
 def test_a_file_has_the_units_of_its_type(tmp_path, name, value, dtype):

@@ -62,16 +62,6 @@ def test_npz_with_labels(tmp_path):
     assert not frame.is_cube
 
 
-def test_sixteen_bit_png_is_millimetres(tmp_path, info):
-    image = np.full((48, 64), 1234, np.uint16)
-    image[5, 6] = 0
-    cv2.imwrite(str(tmp_path / "depth.png"), image)
-    frame = read(tmp_path / "depth.png", info)
-    assert frame.depth[0, 0] == pytest.approx(1.234, abs=1e-6)
-    assert np.isnan(frame.depth[5, 6])
-    assert frame.camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
-
-
 def test_a_printed_message_is_a_camera_info_too(tmp_path):
     path = tmp_path / "echo.yaml"
     message = {"width": 64, "height": 48, "d": [], "k": K.ravel().tolist(), "p": [0.0] * 12}
@@ -192,7 +182,10 @@ def test_bad_images_are_named(tmp_path, info):
 
 @pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), MemoryError("Unable to allocate 1 TiB")])
 def test_what_the_system_refuses_is_named(tmp_path, info, monkeypatch, error):
+    """A mask too, also that of a bag's frame: one unreadable file must not end the whole run."""
     cv2.imwrite(str(tmp_path / "depth.png"), np.ones((48, 64), np.uint16))
+    masks = Reading(masks=tmp_path)
+    assert masks.labels("depth", np.ones((48, 64))).all()
 
     def refused(*_, **__):
         raise error
@@ -200,19 +193,9 @@ def test_what_the_system_refuses_is_named(tmp_path, info, monkeypatch, error):
     monkeypatch.setattr(np, "fromfile", refused)
     with pytest.raises(FrameError, match=re.escape(str(error))):
         read(tmp_path / "depth.png", info)
-
-
-def test_a_mask_that_the_system_refuses_is_named(tmp_path, monkeypatch):
-    """Of a bag's frame too, which takes its masks so: one unreadable file must not end the whole run."""
-    cv2.imwrite(str(tmp_path / "a.png"), np.ones((48, 64), np.uint8))
-    assert Reading(masks=tmp_path).labels("a", np.ones((48, 64))).all()
-
-    def refused(*_, **__):
-        raise PermissionError(13, "Permission denied")
-
-    monkeypatch.setattr(np, "fromfile", refused)
-    with pytest.raises(FrameError, match="Permission denied"):
-        Reading(masks=tmp_path).labels("a", np.ones((48, 64)))
+    if isinstance(error, OSError):
+        with pytest.raises(FrameError, match=re.escape(str(error))):
+            masks.labels("depth", np.ones((48, 64)))
 
 
 def test_names_that_no_file_can_have_are_named(tmp_path):

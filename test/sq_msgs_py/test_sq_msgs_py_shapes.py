@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from random_bodies import random_bodies as random_bodies_of_cloud
 
 pytest.importorskip("shape_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
 
@@ -20,7 +23,6 @@ from sq_msgs_py.shapes import (
     primitive,
     primitives,
 )
-from sq_msgs_py.superquadrics import SuperquadricArray
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, mesh
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -154,12 +156,9 @@ def test_a_mesh_message_holds_what_it_was_made_of():
     assert [list(t.vertex_indices) for t in message.triangles] == np.asarray(made.faces).tolist()
 
 
-def test_arrays_get_one_solid_each():
-    array = SuperquadricArray(
-        size=np.stack([SIZE, ROUND]), shape=np.array([[0.1, 0.1], [0.1, 1.0]]), translation=np.zeros((2, 3)),
-        rotation=np.tile(HERE, (2, 1)), score=np.ones(2), residual=np.zeros(2), sigma_size=np.zeros((2, 3)),
-        id=np.array([1, 2]), status=np.array([0, 0]),
-    )
+def test_arrays_get_one_solid_each(rng):
+    shape = np.array([[0.1, 0.1], [0.1, 1.0]])
+    array = replace(random_bodies_of_cloud(2, rng), size=np.stack([SIZE, ROUND]), shape=shape)
     assert [solid.kind for solid in primitives(array)] == [BOX, CYLINDER]
 
 
