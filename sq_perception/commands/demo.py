@@ -69,8 +69,8 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
     """Print the table, and write picture and mesh of the last image."""
     import numpy as np
 
-    from sq_perception.evaluation.demo_figure import demo_figure
     from sq_perception.evaluation.plots import save
+    from sq_perception.evaluation.recovery_figure import demo_figure
     from sq_perception.geometry.mesh import export
     from sq_perception.simulation.scenes import TABLE_CAMERA
 

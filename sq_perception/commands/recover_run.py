@@ -1,31 +1,103 @@
-"""The run of ``sq-perception recover`` over its frames, and its summary."""
+"""The run of ``sq-perception recover`` over its frames, and its summary.
+
+It prints a line per body, each reason once, and details on request:
+
+    0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m
+
+The number is the body's index in ``superquadrics``, as in meshes and pictures.
+"""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import math
+import re
 import statistics
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from sq_perception.commands import console
 from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, fail, reject_usage
-from sq_perception.commands.recover_lines import lines, scene_lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import CUT_SHORT, Status
 from sq_perception.geometry import kernel_cache
 from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
-from sq_perception.recordings.camera_poses import CameraPoses
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
-from sq_perception.recordings.tracks import RecordedTracks, sequence_of
+from sq_perception.recordings.tracks import CameraPoses, RecordedTracks, sequence_of
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.recovery.recovery import edges_as_text, place_as_text
 from sq_perception.recovery.still_scene import StillScene
+
+_AXES = re.compile(" along [xyz]( and [xyz])*")
+"""Names of axes, which the deviations show anyway."""
+
+
+def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
+    """Return the lines of all frames, then the reasons with their number of bodies."""
+    reasons: Counter[tuple[str, str]] = Counter()
+    for entry in entries:
+        stamp = entry["stamp"]
+        taken = "" if stamp is None else f"  {stamp['sec']}.{stamp['nanosec']:09d}"
+        yield f"{entry['file']}{taken}  {entry['ms']:.0f} ms  {entry['message']}".rstrip()
+        if verbose:
+            yield "  " + ", ".join(f"{stage} {value:.0f} ms" for stage, value in entry["ms_by_stage"].items())
+        for number, body in enumerate(entry["superquadrics"]):
+            yield "  " + _line(number, body, entry["coordinates"] == "cube")
+            for part in body.get("parts", ()):
+                edges = edges_as_text(part["size"], _sigmas(part), False)
+                place = place_as_text(part["translation"], False)
+                yield f"    part {part['share']:.0%} {part['status']} {edges} at {place}"
+            if verbose:
+                yield "    " + _details(body)
+            elif body["status"] != "converged":
+                reasons[body["status"], _AXES.sub("", body["message"].partition(";")[0])] += 1
+    for (status, reason), count in reasons.most_common():
+        yield f"{count} {status}: {reason}"
+    if reasons:
+        yield "what to do with them: docs/how_sure.md; -v shows more of each body"
+
+
+def scene_lines(scene: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Return the lines of the bodies of all frames together, in the world of their camera poses."""
+    for body in scene:
+        edges, place = edges_as_text(body["size"], body["sigma_size"], False), place_as_text(body["translation"], False)
+        yield f"  {body['status']} {edges} at {place} id {body['id']}, in {body['seen']} frames"
+
+
+def _line(number: int, body: Mapping[str, Any], is_cube: bool) -> str:
+    parts = [str(number), body["status"]]
+    if CUT_SHORT in body["message"]:
+        parts.append(f"({CUT_SHORT})")
+    if body["status"] != "failed":
+        parts.append(edges_as_text(body["size"], _sigmas(body), is_cube))
+    parts.append(f"at {place_as_text(body['translation'], is_cube)}")
+    if body["label"] is not None:
+        parts.append(f" mask {body['label']}")
+    if body["track"] is not None:
+        parts.append(f" id {body['track']['id']}")
+    return " ".join(parts)
+
+
+def _sigmas(body: Mapping[str, Any]) -> list[float]:
+    return [math.nan if value is None else value for value in body["sigma_size"]]
+
+
+def _details(body: Mapping[str, Any]) -> str:
+    known = {
+        "exponents": " ".join(f"{value:.2f}" for value in body["shape"]),
+        "score": f"{body['score']:.3f}",
+        "seen": " ".join("?" if share is None else f"{share:.0%}" for share in body["seen"]),
+        "pixels": str(body["pixels"]),
+    }
+    return ", ".join(f"{name} {value}" for name, value in known.items()) + f": {body['message']}"
 
 
 def run(options: argparse.Namespace) -> int:

@@ -1,8 +1,8 @@
-"""One picture of a recovered frame: input, masks, outlines, views from two sides, and the numbers of its bodies."""
+"""Pictures of a recovered frame, and of the demonstration."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from textwrap import shorten
 
 import numpy as np
@@ -14,16 +14,55 @@ from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
+from sq_perception.geometry.mesh import outline
+from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, edges_as_text
+from sq_perception.segmentation.segments import segment
 
 _LONGEST = 68
 """Characters of a verdict that fit in a line."""
 _MOST_LISTED = 8
 
 
+def demo_figure(
+    depth: np.ndarray,
+    camera: Camera,
+    truth: Sequence[Superquadric],
+    methods: Mapping[str, Sequence[Superquadric]],
+) -> Figure:
+    """Draw a column for the image and its true bodies, and one a method: outlines above, bodies in space below.
+
+    Parameters
+    ----------
+    depth : (height, width)
+        Metres, NaN for no reading.
+    truth, methods
+        Single bodies in the optical frame, those of the methods by title.
+    """
+    columns = {"true bodies": truth, **methods}
+    figure = plots.new_figure(5.0 * len(columns), 8.6)
+    wires = [line for body in truth for line in outline(body, 64)]
+    figure.text(
+        0.015, 0.955, "Superquadrics recovered from one depth image", fontsize=15, weight="bold", color=plots.INK
+    )
+    grid = figure.add_gridspec(2, len(columns), left=0.015, right=0.985, top=0.9, bottom=0.01, wspace=0.05, hspace=0.1)
+    window = plots.window_of(truth, camera)
+    limits, plane = plots.span_within(depth, window), segment(depth, camera).plane
+    for k, (title, bodies) in enumerate(columns.items()):
+        above, below = figure.add_subplot(grid[0, k]), figure.add_subplot(grid[1, k])
+        plots.draw_depth(above, depth, limits, window)
+        if k:
+            plots.draw_outlines(above, bodies, camera, width=1.8)
+        plots.heading_of(above, title if k else "depth image", "" if k else f"{limits[0]:.2f} to {limits[1]:.2f} m")
+        look = {"wires": wires} if k else {"colours": np.array([[0.62, 0.66, 0.7]])}
+        draw_bodies_3d(below, bodies, plane=plane, elevation=25, azimuth=40, **look)
+        plots.heading_of(below, title, "wires: the true bodies" if k else "seen from the side")
+    return figure
+
+
 def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, title: str = "") -> Figure:
-    """Input and masks, outlines on the depth image, two 3D views, numbers.
+    """Draw input and masks, outlines on the depth image, views from two sides, and the numbers of the bodies.
 
     A body has the same number, its place in ``recovery.bodies``, wherever it is drawn.  Lengths are metres, or sides of
     the unit cube, which an orthographic camera sees.

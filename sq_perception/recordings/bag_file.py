@@ -13,7 +13,7 @@ Label images on the one topic that is called ``mask/image``, with or without a n
 images with their stamps; they may have been recorded later, and in another order.  Of several such topics none is
 taken, and frames say so.
 
-The camera is that of one topic (:mod:`sq_perception.recordings.bag_camera`): the message with the image's stamp;
+The camera is that of one topic (:mod:`sq_perception.recordings.bag_reader`): the message with the image's stamp;
 failing that, the last one before the image; failing that, the bag's first, however late.  The name of the images' topic
 decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
 
@@ -36,9 +36,8 @@ from sq_msgs_py import depth_image
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
-from sq_perception.recordings import bag_camera, publication
-from sq_perception.recordings.bag_camera import raw_topic
-from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, describe
+from sq_perception.recordings import bag_reader, publication
+from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, describe, raw_topic
 from sq_perception.recordings.camera_file import read_camera_info
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
@@ -147,7 +146,7 @@ class RecordedBag:
             self._reader = opened.enter_context(closing(BagReader(self._path)))
             self.topic = self._choose(self._options.topic)
             first = next(self._first_images(self.topic), None)
-            self._info_topic = bag_camera.info_topic(self._reader, self.topic, first, self._options.camera_info_topic)
+            self._info_topic = bag_reader.info_topic(self._reader, self.topic, first, self._options.camera_info_topic)
             others = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
             self._mask_topics = sorted(topic for topic in others if topic.endswith(_MASKS))
             self._masks = opened.enter_context(closing(self._recorded_masks()))

@@ -37,7 +37,7 @@ from sq_msgs_py.superquadrics import to_message
 from sq_perception.files.output_file import OutputFile
 from sq_perception.imaging.calibration import intrinsics
 from sq_perception.recordings import publication
-from sq_perception.recordings.bag_camera import camera_info_topic, raw_topic
+from sq_perception.recordings.bag_reader import camera_info_topic, raw_topic
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, Findings, Identified
 from sq_perception.recordings.tracks import INTERVAL

@@ -94,7 +94,7 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     # In one of seven views ten bodies do not fit.
     for _ in range(10):
-        plane = table_plane(rng, (0.7, 1.0), np.deg2rad((30.0, 60.0)))
+        plane = table_plane(rng, (0.7, 1.0), (np.pi / 6, np.pi / 3))
         bodies: list[Superquadric] = []
         reach: list[float] = []
         for _ in range(2000):

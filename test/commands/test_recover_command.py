@@ -19,7 +19,7 @@ from table_scenes import VGA, Table
 
 from sq_perception.commands import main, recover_outputs
 from sq_perception.commands.console import complain
-from sq_perception.commands.recover_lines import lines
+from sq_perception.commands.recover_run import lines
 from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions

@@ -16,7 +16,7 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
 
 from sq_perception.commands.demo import match
-from sq_perception.evaluation.demo_figure import demo_figure
+from sq_perception.evaluation.recovery_figure import demo_figure
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
