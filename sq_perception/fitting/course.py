@@ -88,7 +88,8 @@ _AS_HULL = ("like the convex hull of the object",)
 
 def problem_of(observation: Observation, options: FitOptions, deadline: float) -> Problem:
     """The problem of an object as a superquadric, or as a thing where its observation knows a model error."""
-    plane, model_error, taper, hull = options.plane, observation.model_error, 0.0, None
+    plane, model_error = options.plane, observation.model_error
+    hull = options.predicted_hull() if model_error else None
     terms = Terms(
         hit_tolerance=_HIT_TOLERANCE,
         pinhole=1.0 if observation.camera.is_pinhole else 0.0,
@@ -105,14 +106,14 @@ def problem_of(observation: Observation, options: FitOptions, deadline: float) -
             volume_price=_VOLUME_PRICE,
         )
     if model_error:
-        observation, hull = observation.of_hull(), options.predicted_hull()
+        observation = observation.of_hull()
         terms = terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY)
         if hull is None:
             terms = terms._replace(volume_price=_VOLUME_PRICE, roundness_stiffness=1 / ROUND_SIGMA)
         else:
-            taper, terms = TAPER, _beside(hull, terms)
-    independent = INDEPENDENT if model_error else None
-    return Problem(observation, options, terms, limits(observation.points, taper), deadline, independent, hull)
+            terms = _beside(hull, terms)
+    bounds = limits(observation.points, 0.0 if hull is None else TAPER)
+    return Problem(observation, options, terms, bounds, deadline, INDEPENDENT if model_error else None, hull)
 
 
 def _beside(hull: HullPrior, terms: Terms) -> Terms:
