@@ -60,7 +60,7 @@ __all__ = [
     "render_recovery",
 ]
 
-_DOUBT = 0.02
+_DOUBT = 0.1
 """Probability that two objects are one, from which on it counts."""
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
