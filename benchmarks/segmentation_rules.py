@@ -56,7 +56,6 @@ _S = "sq_perception.segmentation"
 _OWN = "sq_perception.recovery.own_segments"
 RULES: dict[str, dict[str, Any]] = {
     "plane: things are near above it (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
-    "plane: best of finalists alone (_FINALISTS)": {f"{_S}.support_plane._FINALISTS": 1},
     "support: bent": {f"{_S}.support_surface._DISTORTION": 0.0},
     "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
     "level tops (level_faces)": {f"{_S}.level_faces.found": lambda *_: []},
@@ -74,7 +73,7 @@ RULES: dict[str, dict[str, Any]] = {
     "network: a probability that it is a thing (LEAST)": {f"{_S}.objectness.LEAST": 0.0},
     "network: parts": {f"{_OWN}.SegmentNetwork._parted": lambda *_: []},
     "network: a part claims itself (_ITSELF)": {f"{_OWN}._ITSELF": 0.0},
-    "network: joins": {f"{_OWN}._ONE": 1.0},
+    "network: joins": {f"{_OWN}._ONE": (0.5, -np.inf)},
     "network: all of it": {f"{_OWN}.SegmentNetwork.improved": lambda self, found: found},
 }
 """What is put in the place of each rule; a rule that is gone from the package is gone from here."""

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from sq_perception.fitting import solina_bajcsy, surface_fit
+from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, PlaneError
 from sq_perception.fitting.rays import SAMPLE
@@ -23,6 +25,7 @@ _LEAST_MEASURED = 0.02
 """Share of a mask: a sensor that sees nothing of a thing smears its outline.  Of 3582 things of
 benchmarks/household_things 63 showed less; 16 had a body all the same, of 20 % IoU at most."""
 _PLANE_ABOVE = "the plane found lies above it and was left aside"
+_MAY_GO_ON = "it may go on in what is next to it"
 _LEAST_BUDGET = 1e-6
 """Seconds; an object whose turn comes too late is still fitted, from one start."""
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
@@ -67,6 +70,29 @@ def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitO
     predicted = obj.prediction.body
     options = replace(known, expected=predicted, hull=obj.prediction.hull)
     return surface_fit.fit(depth, obj.mask, camera, start=predicted, options=options)
+
+
+def widened(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
+    """The fit of an object, unsure by how much farther it would reach if others were parts of it.
+
+    With the probability q that another is, and d by how much half sizes and centre of the box around both exceed those
+    of the body, second moments about the body grow by q d d^T: (1 - q) S + q (S + d d^T).
+    """
+    if not np.isfinite(fit.covariance).all():
+        return fit
+    body, covariance = fit.superquadric, fit.covariance.copy()
+    turn, size = body.rotation_matrix, body.untapered().size
+    for likely, other in others:
+        along = (other.points - body.translation) @ turn
+        low, high = np.minimum(along.min(axis=0), -size), np.maximum(along.max(axis=0), size)
+        farther = np.zeros(len(covariance))
+        farther[0:3] = 0.5 * (high - low) - size
+        farther[5:8] = turn @ (0.5 * (high + low))
+        covariance += likely * np.outer(farther, farther)
+    is_open = fit.status == Status.CONVERGED and undetermined(covariance, body.size).any()
+    if not is_open:
+        return replace(fit, covariance=covariance)
+    return replace(fit, covariance=covariance, status=Status.WEAK, message=_MAY_GO_ON)
 
 
 def _predict(obj: SeenObject) -> Fit:

@@ -9,11 +9,12 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
               that no object claims.  A piece shows another object if it claims itself, and if it and the objects
               found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the object
               that claims it most
-    joined    a and b are one if each is the other's object: if the smaller of the means of p_a over b and of p_b over a
-              is more than ``_ONE``; the surest pairs first, until there is none.  Not where both together are larger
-              than ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
+    joined    a and b are one with log odds of k (l_ab + l_ba) + c, by the mean l_ab of the logit of p_a over b; the
+              surest pairs first, until none is more likely one than two.  Not where both together are larger than
+              ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
     outliers  pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
-              label image, as they are no background either, but no fit takes them for the object's surface
+              label image, as they are no background either, but no fit takes them for the object's surface; of the
+              others p_a is the membership
     nothing   a is dropped if it is no thing (:mod:`sq_perception.segmentation.objectness`), by the median logit of p_a
               over it and by its rise: a bump of the table, a wall, the room behind; not where there is no support
               plane, as all that is seen may be the object
@@ -36,14 +37,15 @@ from sq_perception.imaging import canonical_view, regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.segmentation import objectness, pieces, segments
+from sq_perception.segmentation import objectness, pieces
+from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.segments import Segmentation
 
-_ONE = 0.45
-"""Segments are joined above it.  Of 884 simulated things 0.4, 0.45 and 0.5 miss 59, 57 and 57, and leave 61, 69 and 74
-bodies of none, or of parts; of 780 superquadrics in crowds they miss 32, 30 and 30."""
+_ONE = (0.5, -0.5)
+"""k and c: of a logistic regression over pairs of segments of simulated scenes."""
+_CLEAREST = 6.0
+"""A logit tells no more than this, either way."""
 _PIECES = 4
 """Pieces of a segment.  Each should show one thing, and enough of it to tell things apart."""
 _SURE = 0.85
@@ -109,7 +111,7 @@ class SegmentNetwork:
     mapped: _Mapped
     max_size: float = LARGEST_THING
 
-    def improved(self, found: Segmentation) -> Segmentation:
+    def improved(self, found: FrameEvidence) -> FrameEvidence:
         """Segments parted, joined, with their outliers, without those of nothing; labels from 1, the largest first."""
         if not found.ids:
             return found
@@ -121,12 +123,14 @@ class SegmentNetwork:
         while len(seen) > 1 and (joined := self._join(labels, seen)):
             seen |= self._seen(labels, joined)
         likely = self._things(labels, seen, found.heights)
-        outliers = np.zeros(labels.shape, bool)
+        membership = np.ones(labels.shape, np.float32)
         for label in likely:
             window = seen[label].window
-            outliers[window] |= _outliers(labels[window] == label, _logits(seen[label]))
-        found = replace(found, labels=labels, outliers=outliers)
-        return segments.kept(found, likely)
+            _write_membership(membership[window], labels[window] == label, _logits(seen[label]))
+        odds = np.maximum(_odds_of_one(labels, seen), -_CLEAREST)
+        same = np.triu(_probability(odds), 1)
+        found = replace(found, labels=labels, ids=tuple(seen), membership=membership, same=same + same.T)
+        return found.kept(likely)
 
     def _things(
         self, labels: np.ndarray, seen: Mapping[int, _Seen], heights: HeightEvidence | None
@@ -154,12 +158,12 @@ class SegmentNetwork:
 
     def _join(self, labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
         """Join pairs that are each other's object, each segment with one other; the labels that remain of them."""
-        mutual, order = _mutual(labels, seen), list(seen)
+        odds, order = _odds_of_one(labels, seen), list(seen)
         remain: list[int] = []
         taken: set[int] = set()
-        for pair in np.argsort(-mutual, axis=None):
+        for pair in np.argsort(-odds, axis=None):
             i, j = divmod(int(pair), len(order))
-            if mutual[i, j] <= _ONE:
+            if odds[i, j] <= 0:
                 break
             if not taken & {i, j} and self._may_be_one((labels == order[i]) | (labels == order[j])):
                 taken |= {i, j}
@@ -263,24 +267,27 @@ def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.nda
     return [int(name) for name in names]
 
 
-def _mutual(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
-    """The smaller of the means of p_a over b and of p_b over a, for pairs (n, n) of segments; 0 below the diagonal."""
-    means = np.zeros((len(seen), len(seen)))
+def _odds_of_one(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
+    """The log odds that two segments are one, for pairs (n, n) above the diagonal; -inf out of each other's view."""
+    claims = np.full((len(seen), len(seen)), -np.inf)
     for i, answer in enumerate(seen.values()):
         if answer.view.image[..., segment_view.OTHERS].any():
-            means[i] = _claims(labels, answer)[list(seen)]
-    return np.triu(np.minimum(means, means.T), 1)
+            claims[i] = _claims(labels, answer)[list(seen)]
+    slope, offset = _ONE
+    claims = slope * (claims + claims.T) + offset
+    claims[np.tril_indices(len(seen))] = -np.inf
+    return claims
 
 
 def _claims(labels: np.ndarray, answer: _Seen) -> np.ndarray:
-    """The mean of p over each label in a view; 0 over 0, and over those of next to no cells."""
+    """The mean of the logit of p over each label in a view; -inf over 0, and over those of next to no cells."""
     height, width = labels.shape
     grid = np.ix_(np.clip(answer.view.rows, 0, height - 1), np.clip(answer.view.columns, 0, width - 1))
     there = np.where(answer.view.image[..., segment_view.IMAGE] > 0, labels[grid], 0).ravel()
     counts = np.bincount(there, minlength=int(labels.max()) + 1)
-    sums = np.bincount(there, _probability(answer.logits).ravel(), len(counts))
+    sums = np.bincount(there, np.clip(answer.logits, -_CLEAREST, _CLEAREST).ravel(), len(counts))
     counts[0] = 0
-    return np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), 0)
+    return np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), -np.inf)
 
 
 def _logits(answer: _Seen) -> np.ndarray:
@@ -288,12 +295,9 @@ def _logits(answer: _Seen) -> np.ndarray:
     return answer.view.at_pixels(answer.logits, answer.window)
 
 
-def _outliers(inside: np.ndarray, logits: np.ndarray) -> np.ndarray:
-    """The pixels of a segment that are not its object's own.
-
-    None where they are most of it, as the object is what most of the segment shows, or nearly all.
-    """
-    own = inside & (logits >= 0)
-    count = np.count_nonzero(own)
-    contradicts = 2 * count < np.count_nonzero(inside) or count < MIN_PIXELS
-    return np.zeros_like(inside) if contradicts else inside & ~own
+def _write_membership(membership: np.ndarray, inside: np.ndarray, logits: np.ndarray) -> None:
+    """Write p to the pixels of a segment; not where it contradicts the segment, as most of it is the object, or nearly
+    all."""
+    count = np.count_nonzero(inside & (logits >= 0))
+    if 2 * count >= np.count_nonzero(inside) and count >= MIN_PIXELS:
+        membership[inside] = _probability(logits[inside])

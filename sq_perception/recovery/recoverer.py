@@ -49,6 +49,7 @@ from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
+from sq_perception.segmentation.evidence import FrameEvidence
 
 __all__ = [
     "FrameRecovery",
@@ -59,6 +60,8 @@ __all__ = [
     "render_recovery",
 ]
 
+_DOUBT = 0.1
+"""Probability that two objects are one, from which on it counts."""
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
@@ -102,7 +105,7 @@ class Found:
         The one with most pixels first.
     """
 
-    segmentation: segments.Segmentation
+    segmentation: FrameEvidence
     depth: np.ndarray
     objects: list[SeenObject]
 
@@ -232,7 +235,7 @@ class Recoverer:
         measured, labels, closed = hole_filling.fill(measured, labels)
         return Readings(measured, closed, camera, labels, options or self._options, began)
 
-    def find_objects(self, readings: Readings, segmentation: segments.Segmentation | None = None) -> Found:
+    def find_objects(self, readings: Readings, segmentation: FrameEvidence | None = None) -> Found:
         """Segment an image; or take the segmentation of one that shows the same objects at the same pixels."""
         with self._at_work():
             found = self._segment(readings) if segmentation is None else segmentation
@@ -249,8 +252,10 @@ class Recoverer:
         with self._at_work():
             network = self._network_for(readings)
             config = None if network is None else network.config
-            outliers = found.segmentation.outliers
-            objects = found.objects if outliers is None else [obj.without(outliers) for obj in found.objects]
+            objects = found.objects
+            if found.segmentation.membership is not None:
+                outliers = found.segmentation.outliers
+                objects = [obj.without(outliers) for obj in objects]
 
             def prepare(obj: SeenObject) -> SeenObject:
                 plane = supports.support(obj, objects, depth, camera, found.segmentation, options)
@@ -269,14 +274,15 @@ class Recoverer:
                 fresh = [obj.of_readings(depth, readings.closed, found.segmentation.labels) for obj in fresh]
             deadline = readings.began + options.time_budget
             fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), fresh)
+            fits = _doubted(fits, fresh, objects, found.segmentation)
             made_of = self._find_parts(fresh, fits, depth, readings, network, deadline)
             fitted = time.perf_counter()
 
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
         segmentation = found.segmentation
-        likely = dict(zip(segmentation.ids, segmentation.objectness, strict=False))
+        likely = segmentation.likely()
         recovered = {
-            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely.get(obj.label, 1.0), parts=some)
+            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely[obj.label], parts=some)
             for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True)
         }
         bodies = tuple(known[obj.label] if obj.label in known else recovered[obj.label] for obj in found.objects)
@@ -305,7 +311,7 @@ class Recoverer:
         with one_blas_thread():
             yield
 
-    def _segment(self, readings: Readings) -> segments.Segmentation:
+    def _segment(self, readings: Readings) -> FrameEvidence:
         """The objects of an image: the given masks, or its own segments, which the network of masks improves where
         the network predicts hulls."""
         depth, camera, options = readings.depth, readings.camera, readings.options
@@ -445,7 +451,21 @@ def _doubt(depth: np.ndarray, camera: Camera) -> str:
     return depth_units.wrong_unit(depth) or (ranges.RANGES if ranges.seem_ranges(depth, camera) else "")
 
 
-def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
+def _doubted(
+    fits: Sequence[Fit], fresh: Sequence[SeenObject], objects: Sequence[SeenObject], found: FrameEvidence
+) -> list[Fit]:
+    """The fits of objects, less sure where another object of the frame may be a part of theirs."""
+    if found.same is None:
+        return list(fits)
+    same = dict(zip(found.ids, found.same.tolist(), strict=True))
+    number = {label: k for k, label in enumerate(found.ids)}
+    return [
+        methods.widened(fit, [(q, other) for other in objects if (q := same[obj.label][number[other.label]]) > _DOUBT])
+        for fit, obj in zip(fits, fresh, strict=True)
+    ]
+
+
+def _left_out(found: FrameEvidence, options: RecoveryOptions) -> str:
     """What was seen and is not among the objects, in words."""
     said = []
     if found.larger:
@@ -458,7 +478,7 @@ def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
     return "; ".join(said)
 
 
-def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarray | None) -> str:
+def _why_empty(depth: np.ndarray, found: FrameEvidence, labels: np.ndarray | None) -> str:
     if not np.isfinite(depth).any():
         return "the image holds no depth"
     if labels is not None and labels.max() <= 0:
@@ -470,6 +490,6 @@ def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarr
     return "no support plane and no object found"
 
 
-def _without_support(found: segments.Segmentation, readings: Readings) -> str:
+def _without_support(found: FrameEvidence, readings: Readings) -> str:
     is_own = readings.labels is None and readings.camera.is_pinhole
     return "no support plane found" if is_own and found.plane is None else ""

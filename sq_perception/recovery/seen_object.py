@@ -20,7 +20,7 @@ from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent, shown_step
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.recovery.prediction import Prediction
-from sq_perception.segmentation import segments
+from sq_perception.segmentation.evidence import FrameEvidence
 
 _POINTS = 2000
 """Enough for quantiles of heights to settle."""
@@ -121,7 +121,7 @@ class SeenObject:
         return replace(self.without(gaps), depth_crop=depth[self.window], pixels=int(np.count_nonzero(left)))
 
 
-def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> list[SeenObject]:
+def objects(depth: np.ndarray, found: FrameEvidence, camera: Camera) -> list[SeenObject]:
     """The objects of a segmentation that have a measured pixel, in its order."""
     measured, seen = np.isfinite(depth), []
     for label in found.ids:

@@ -52,7 +52,7 @@ from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Readings, Recoverer
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import SeenObject
-from sq_perception.segmentation.segments import Segmentation
+from sq_perception.segmentation.evidence import FrameEvidence
 
 _WIDTH = 320
 """Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
@@ -108,7 +108,7 @@ class Reference:
     stride: int
     camera: Camera
     options: RecoveryOptions
-    segmentation: Segmentation
+    segmentation: FrameEvidence
     age: int
     given: bool
 
@@ -126,7 +126,7 @@ class Repeated:
     """
 
     bodies: Mapping[int, Recovery]
-    segmentation: Segmentation | None
+    segmentation: FrameEvidence | None
 
 
 NOTHING = Repeated({}, None)

@@ -25,6 +25,7 @@ from sq_perception.imaging import lens
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
 from sq_perception.segmentation import segments, support_plane
+from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.extent import across
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.support_plane import TOLERANCE
@@ -55,7 +56,7 @@ def support(
     others: Iterable[SeenObject],
     depth: np.ndarray,
     camera: Camera,
-    found: segments.Segmentation,
+    found: FrameEvidence,
     options: SegmentationOptions,
 ) -> np.ndarray | None:
     """The plane (4,) that the object stands on; None where it stands on nothing that is known.

@@ -13,11 +13,10 @@ from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import convex_parts
+from sq_perception.segmentation.evidence import LEAST_SIGMA
 from sq_perception.segmentation.support_plane import TOLERANCE
 from sq_perception.segmentation.support_surface import CLEARLY, SupportSurface
 
-LEAST_SIGMA = 5e-4
-"""Noise of the depth at one metre that is assumed at least, metres: rendered images have none."""
 _WIDE, _MEASURED = 9, 0.99
 """Pixels a side of the windows by whose means low things are told from noise, and the share of readings in one that
 tells of the noise."""

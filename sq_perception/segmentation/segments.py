@@ -23,7 +23,7 @@ Metres and pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 
 import cv2
@@ -41,6 +41,7 @@ from sq_perception.segmentation import (
     support_plane,
     support_surface,
 )
+from sq_perception.segmentation.evidence import UNKNOWN_SIGMA, FrameEvidence
 from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
@@ -48,9 +49,6 @@ from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits
 of noise."""
-_UNKNOWN_SIGMA = 1.5e-3
-"""Noise of the depth at one metre where no support shows it, metres: that of structured light (Khoshelham and Oude
-Elberink, Sensors 2012)."""
 _MOST = 128
 """Segments that are looked at, the largest ones: bounds the time of frames that are noise alone."""
 _SIDE_MEASURED = 0.6
@@ -61,45 +59,7 @@ _POINTS = 400
 """Points of a segment for its size and its middle."""
 
 
-@dataclass(frozen=True, eq=False)
-class Segmentation:
-    """Objects of one image.
-
-    Attributes
-    ----------
-    labels : int32 (height, width)
-        0 for background; own labels run from 1, largest object first, labels given from outside keep their values.
-    plane : (4,) or None
-        n and d of the support plane, height above it = n.p + d; None where there is none.
-    ids : tuple of int
-        Labels in the image, the one with most pixels first.
-    sigma
-        Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
-    is_cut
-        Whether there were more objects than ``max_objects``.
-    outliers : bool (height, width) or None
-        Pixels of objects that did not measure them; None: not a single one that is known.
-    objectness : tuple of float
-        The probability, by ``ids``, that each is a thing; 1 for labels given from outside.
-    larger, outside
-        How many objects were left out as they are larger than ``max_size``, or outside of the workspace.
-    heights : HeightEvidence or None
-        What the segments are judged by, until they are.
-    """
-
-    labels: np.ndarray
-    plane: np.ndarray | None
-    ids: tuple[int, ...]
-    sigma: float = _UNKNOWN_SIGMA
-    is_cut: bool = False
-    outliers: np.ndarray | None = None
-    objectness: tuple[float, ...] = ()
-    larger: int = 0
-    outside: int = 0
-    heights: HeightEvidence | None = None
-
-
-def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
+def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> FrameEvidence:
     """Find the objects in a depth image.
 
     Parameters
@@ -110,7 +70,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
 
     Returns
     -------
-    Segmentation
+    FrameEvidence
         Without objects for an empty table, a wall, or an image without depth.
 
     Raises
@@ -122,14 +82,14 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     return limited(judged(proposed(depth, camera, options.depth_range)), depth, camera, options)
 
 
-def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> Segmentation:
+def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> FrameEvidence:
     """Segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
     depth, valid = _checked(depth, camera, depth_range)
     least = least_pixels(depth.size)
     if not camera.is_pinhole:
-        return _ordered(Segmentation(depth_steps.components(valid), None, ()), least)
+        return _ordered(FrameEvidence(depth_steps.components(valid)), least)
     if np.count_nonzero(valid) < least:
-        return Segmentation(np.zeros(depth.shape, np.int32), None, ())
+        return FrameEvidence(np.zeros(depth.shape, np.int32))
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     is_silhouette = _is_silhouette(valid)
     if is_silhouette and _size(valid, known, camera) <= LARGEST_THING:
@@ -141,42 +101,27 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     support = support_surface.measured(plane, known, valid, camera)
     relative = support.image_relative(known, camera)
     labels = bodies.above(known, camera, relative, valid, support)
-    sigma = max(support.sigma, bodies.LEAST_SIGMA)
     tops = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(tops, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, camera, least)
     around = container_walls.walls(tops, plane.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
-    found = _ordered(Segmentation(labels, plane.equation, (), sigma), least)
+    found = _ordered(FrameEvidence(labels, support=support), least)
     if is_silhouette and not found.ids:
         return _without_support(known, valid, camera, least)
     return replace(found, heights=HeightEvidence(relative, found.labels, support.sigma))
 
 
-def judged(found: Segmentation) -> Segmentation:
+def judged(found: FrameEvidence) -> FrameEvidence:
     """Segments that are things by their heights alone: for use without a network."""
     if found.heights is None:
         return found
     rise = found.heights.rise(found.labels, found.ids).tolist()
     likely = {k: objectness.probability(objectness.logit(z)) for k, z in zip(found.ids, rise, strict=True)}
-    return kept(found, {label: each for label, each in likely.items() if each >= objectness.LEAST})
+    return found.kept({label: each for label, each in likely.items() if each >= objectness.LEAST})
 
 
-def kept(found: Segmentation, likely: dict[int, float]) -> Segmentation:
-    """The segments of some labels, with the probability that each is a thing; renumbered from 1, the largest first."""
-    counts = regions.extents(found.labels)[:, 0]
-    order = sorted(likely, key=lambda label: (-counts[label], label))
-    number = np.zeros(len(counts), np.int32)
-    number[order] = np.arange(len(order)) + 1
-    return replace(
-        found,
-        labels=regions.renumber(found.labels, number),
-        ids=tuple(range(1, len(order) + 1)),
-        objectness=tuple(likely[label] for label in order),
-    )
-
-
-def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> Segmentation:
+def limited(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> FrameEvidence:
     """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
     depth, valid = _checked(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
@@ -192,15 +137,15 @@ def limited(found: Segmentation, depth: np.ndarray, camera: Camera, options: Seg
             outside.add(label)
     left = [label for label in found.ids if label not in larger | outside]
     ids = left[: options.max_objects]
-    likely = dict(zip(found.ids, found.objectness or (1.0,) * len(found.ids), strict=True))
+    likely = found.likely()
     is_cut = found.is_cut or len(left) > len(ids)
     found = replace(found, is_cut=is_cut, larger=len(larger), outside=len(outside), heights=None)
-    return kept(found, {label: likely[label] for label in ids})
+    return found.kept({label: likely[label] for label in ids})
 
 
 def from_labels(
     labels: np.ndarray, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
-) -> Segmentation:
+) -> FrameEvidence:
     """Objects given from outside as a label image; the support plane comes from the pixels around them.
 
     Parameters
@@ -212,7 +157,7 @@ def from_labels(
 
     Returns
     -------
-    Segmentation
+    FrameEvidence
         Labels without a valid depth pixel are left out.
 
     Raises
@@ -242,10 +187,8 @@ def from_labels(
     ids = tuple(int(values[k]) for k in order)
     is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
-    plane = None
-    if ids and camera.is_pinhole:
-        plane = support_plane.around(labels, ids, depth, valid, camera)
-    return Segmentation(labels, plane, ids, is_cut=is_cut, objectness=(1.0,) * len(ids))
+    around = support_plane.around(labels, ids, depth, valid, camera) if ids and camera.is_pinhole else None
+    return FrameEvidence(labels, ids, None if around is None else support_surface.flat(around), is_cut=is_cut)
 
 
 def least_pixels(size: int) -> int:
@@ -254,7 +197,7 @@ def least_pixels(size: int) -> int:
 
 
 def support_under(
-    found: Segmentation, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
+    found: FrameEvidence, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
 ) -> np.ndarray | None:
     """The plane (4,) that the surroundings of one object show below it; None if they show none but the segmentation's.
 
@@ -265,7 +208,8 @@ def support_under(
     depth, valid = _checked(depth, camera, options.depth_range)
     if not camera.is_pinhole or not ((found.labels == label) & valid).any():
         return None
-    return support_plane.around(found.labels, (label,), depth, valid, camera, found.plane)
+    around = support_plane.around(found.labels, (label,), depth, valid, camera, found.plane)
+    return None if around is None else around.equation
 
 
 def warm_up() -> None:
@@ -303,13 +247,13 @@ def _is_silhouette(valid: np.ndarray) -> bool:
     return bool(sorted(sides)[-2] < _SIDE_MEASURED)
 
 
-def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least: int) -> Segmentation:
+def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least: int) -> FrameEvidence:
     """The segments of an image that shows no support plane, but those that fill it, as a wall does."""
-    labels = bodies.taken_apart(known, valid, camera, _UNKNOWN_SIGMA)
-    found = _ordered(Segmentation(labels, None, ()), least)
+    labels = bodies.taken_apart(known, valid, camera, UNKNOWN_SIGMA)
+    found = _ordered(FrameEvidence(labels), least)
     extents = regions.extents(found.labels)[:, [3, 1, 4, 2]]
     boxes = {k: (extents[k, 0], extents[k, 1], *(extents[k, 2:] - extents[k, :2])) for k in found.ids}
-    return kept(found, {k: 1.0 for k, box in boxes.items() if _is_silhouette(valid) or not regions.fills(box, valid)})
+    return found.kept({k: 1.0 for k, box in boxes.items() if _is_silhouette(valid) or not regions.fills(box, valid)})
 
 
 def _unloaded(
@@ -318,15 +262,15 @@ def _unloaded(
     """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
     relative = face.surface.image_relative(known, camera)
     valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    parts = _ordered(Segmentation(bodies.above(known, camera, relative * valid, valid, face.surface), None, ()), least)
+    parts = _ordered(FrameEvidence(bodies.above(known, camera, relative * valid, valid, face.surface)), least)
     heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.surface.sigma)
     parts = judged(replace(parts, heights=heights))
     return np.where(parts.labels > 0, parts.labels + labels.max(), labels)
 
 
-def _ordered(found: Segmentation, least: int) -> Segmentation:
+def _ordered(found: FrameEvidence, least: int) -> FrameEvidence:
     """The largest segments of at least so many pixels."""
     counts = regions.extents(found.labels)[:, 0]
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
-    return kept(replace(found, is_cut=len(order) > _MOST), dict.fromkeys(order[:_MOST].tolist(), 1.0))
+    return replace(found, is_cut=len(order) > _MOST).kept(dict.fromkeys(order[:_MOST].tolist(), 1.0))

@@ -37,9 +37,9 @@ _SEED = 0
 _PLANE_POINTS, _REFINE_POINTS = 1500, 8000
 """On so many points planes are counted, and the best one is fitted: a share of a tenth is then known to 8 % of itself,
 and a height to a hundredth of the noise."""
-_HYPOTHESES, _FEW_POINTS, _FINALISTS = 1000, 300, 50
-"""So many draws are counted on a few points, and the best of them on all: of 15 % of the points one plane in thirty is
-missed, of 10 % one in three."""
+_HYPOTHESES, _FEW_POINTS = 1000, 300
+"""So many draws are counted on a few points: of 15 % of the points one plane in thirty is missed, of 10 % one in
+three."""
 _PLANES = 3
 """A table, the floor below it and a wall behind it."""
 _APART = 2
@@ -133,8 +133,8 @@ def around(
     valid: np.ndarray,
     camera: Camera,
     known: np.ndarray | None = None,
-) -> np.ndarray | None:
-    """The support plane (4,) from the unlabelled pixels near the bodies: below all of them, and touched.
+) -> Plane | None:
+    """The support plane from the unlabelled pixels near the bodies: below all of them, and touched.
 
     None also where these pixels show no plane but a ``known`` one (4,).
     """
@@ -162,7 +162,8 @@ def around(
         near[rows[on], columns[on]] = False
         if np.count_nonzero(~on) < _LEAST_SHARE * len(points):
             return None
-    best, best_vote = None, 0.0
+    best: Plane | None = None
+    best_vote = 0.0
     for plane in planes(depth, near, camera):
         contact = []
         for points in bodies:
@@ -172,7 +173,7 @@ def around(
             contact.append(np.exp(-np.abs(lowest) / (4 * TOLERANCE)) if middle > 0 else 0.0)
         vote = _vote(plane) * float(np.mean(contact))
         if vote > best_vote:
-            best, best_vote = plane.equation, vote
+            best, best_vote = plane, vote
     return best
 
 
@@ -186,15 +187,12 @@ def _some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera, count: i
 def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
     """The plane (4,) with most points within the tolerance * z^2, and which points these are."""
     few = points[:: max(1, len(points) // _PLANE_POINTS)]
-    weight = (1 / (TOLERANCE * noise_growth(few[:, 2]))).astype(np.float32)
-    weighted = np.stack([*few.T, np.ones(len(few))]).astype(np.float32) * weight
     candidates = _through_three(few, _HYPOTHESES, rng)
     if not len(candidates):
         return None, np.zeros(len(points), bool)
-    fewer = np.ascontiguousarray(weighted[:, :: max(1, len(few) // _FEW_POINTS)])
-    finalists = candidates[np.argsort(-_votes(candidates, fewer), kind="stable")[:_FINALISTS]]
-    best = finalists[_votes(finalists, weighted).argmax()]
-    plane = best.astype(float)
+    fewer = few[:: max(1, len(few) // _FEW_POINTS)]
+    weighted = np.stack([*fewer.T, np.ones(len(fewer))]) / (TOLERANCE * noise_growth(fewer[:, 2]))
+    plane = candidates[_votes(candidates, weighted.astype(np.float32)).argmax()].astype(float)
     growth = noise_growth(points[:, 2])
     reach, weights, rows = TOLERANCE * growth, growth**-2, np.ascontiguousarray(points.T)
     for share in (1.0, 1.0, 0.5):

@@ -79,6 +79,11 @@ class SupportSurface:
         return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
 
 
+def flat(plane: Plane) -> SupportSurface:
+    """A plane that is not known to be bent."""
+    return SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
+
+
 def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
     """The surface that a plane was seen as.
 
@@ -97,16 +102,15 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     z = points[:, 2]
     x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
     height = plane.height(points) / growth
-    flat = SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
     on = np.abs(height) < TOLERANCE
     if not on.any():
-        return flat
+        return flat(plane)
     limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
-    bend, off = flat.bend, height
+    bend, off = np.zeros(_TERMS), height
     for _ in range(_ROUNDS):
         gram, right = _normal_equations(x, y, height, off)
         if gram[0, 0] < 10 * _TERMS:
-            return flat
+            return flat(plane)
         bend = np.linalg.lstsq(gram, right, rcond=None)[0]
         off, is_settled = _off(x, y, height, bend, limit, off)
         if is_settled:

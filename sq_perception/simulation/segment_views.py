@@ -26,6 +26,7 @@ from sq_perception.imaging import regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.segmentation import pieces, segments
+from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
 from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
@@ -134,7 +135,7 @@ def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.n
 
 
 def _of_merged(
-    label: int, found: segments.Segmentation, measured: _Measured, rng: np.random.Generator
+    label: int, found: FrameEvidence, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Return images and truth of each object in a merged segment, and of pieces of it joined to a neighbour."""
     mask = found.labels == label

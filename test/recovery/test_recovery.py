@@ -23,8 +23,9 @@ from sq_perception.learning import checkpoint
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
-from sq_perception.segmentation import segments
-from sq_perception.segmentation.segments import Segmentation
+from sq_perception.segmentation.evidence import FrameEvidence
+from sq_perception.segmentation.support_plane import Plane
+from sq_perception.segmentation.support_surface import flat
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -248,7 +249,7 @@ def test_parting_segments_makes_no_more_objects_than_are_wanted(monkeypatch):
     labels = np.zeros((48, 64), np.int32)
     for k in range(3):
         labels[10:30, 10 + 15 * k : 20 + 15 * k] = k + 1
-    parted = Segmentation(labels, None, (1, 2, 3))
+    parted = FrameEvidence(labels, (1, 2, 3))
     monkeypatch.setattr(own_segments.SegmentNetwork, "improved", lambda *_: parted)
     camera = Camera(64, 48, 60.0, 60.0, 32, 24)
     found = Recoverer().recover(np.ones((48, 64), np.float32), camera, options=RecoveryOptions(max_objects=2))
@@ -263,7 +264,7 @@ def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
     depth, truth = table.see([table.body(-0.1, 0, (0.06, 0.06, 0.05)), table.body(0.12, 0, (0.03, 0.03, 0.03))])
 
     def without_the_largest(_, found):
-        return segments.kept(found, dict.fromkeys(found.ids[1:], 1.0))
+        return found.kept(dict.fromkeys(found.ids[1:], 1.0))
 
     monkeypatch.setattr(own_segments.SegmentNetwork, "improved", without_the_largest)
     found = Recoverer().recover(depth, VGA, options=RecoveryOptions(max_objects=1))
@@ -345,7 +346,7 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     assert small.sum() > 200
     found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
     assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
-    given = Segmentation(small, scene.plane, (1,))
+    given = FrameEvidence(small, (1,), flat(Plane(scene.plane, 1.0, 1e-3)))
     (obj,) = seen_object.objects(depth, given, CAMERA)
     whole = seen_object.completed(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()

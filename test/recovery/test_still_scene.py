@@ -278,7 +278,8 @@ def test_outliers_of_a_segment_are_none_of_its_body_when_its_turn_comes():
     first = after(recoverer, None, image(STILL, 0))
     segments = first.segmentation
     mask = first.recovery.labels == first.recovery.bodies[0].label
-    half = replace(segments, outliers=mask & (np.arange(CAMERA.width) > np.median(np.nonzero(mask)[1])))
+    taken = mask & (np.arange(CAMERA.width) > np.median(np.nonzero(mask)[1]))
+    half = replace(segments, membership=np.where(taken, 0, 1).astype(np.float32))
     waiting = with_bodies(first, [replace(first.recovery.bodies[0], repeats=30), *first.recovery.bodies[1:]])
     waiting = replace(waiting, segmentation=half)
     frame = after(recoverer, waiting, image(STILL, 1))

@@ -11,8 +11,11 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
+from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.options import SegmentationOptions
-from sq_perception.segmentation.segments import Segmentation, from_labels, segment, support_under
+from sq_perception.segmentation.segments import from_labels, segment, support_under
+from sq_perception.segmentation.support_plane import Plane
+from sq_perception.segmentation.support_surface import flat
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 
@@ -289,7 +292,7 @@ def test_another_support_is_sought_where_the_surroundings_show_one():
     depth = np.where(on_shelf, np.fmin(depth, table_depth(plane=shelf)), depth).astype(np.float32)
     labels[(labels == 2) & (depth < table_depth(plane=shelf) - 1e-3)] = 3
     labels[labels == 2] = 0
-    found = Segmentation(labels, PLANE, (1, 3))
+    found = FrameEvidence(labels, (1, 3), flat(Plane(PLANE, 1.0, 1e-3)))
     np.testing.assert_allclose(support_under(found, 3, depth, CAMERA), shelf, atol=2e-3)
     assert support_under(found, 1, depth, CAMERA) is None
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sq_perception.imaging.segment_view import IMAGE, MEASURED, SEGMENT
-from sq_perception.segmentation.segments import Segmentation
+from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.simulation import segment_views
 from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
 
@@ -47,7 +47,7 @@ def test_the_same_seed_draws_the_same_views() -> None:
 
 
 def test_scenes_without_segments_give_an_empty_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    nothing = segment_views.segments.Segmentation(np.zeros((1, 1), np.int32), None, ())
+    nothing = FrameEvidence(np.zeros((1, 1), np.int32))
     monkeypatch.setattr(segment_views.segments, "segment", lambda *_: nothing)
     assert draw_segment_views(1, np.random.default_rng(1)).truth.shape == (0, 64, 64)
 
@@ -55,7 +55,7 @@ def test_scenes_without_segments_give_an_empty_batch(monkeypatch: pytest.MonkeyP
 def test_pieces_of_merged_things_show_one_thing_each_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
     find = segment_views.segments.segment
 
-    def merged(*image: Any) -> Segmentation:
+    def merged(*image: Any) -> FrameEvidence:
         found = find(*image)
         return replace(found, labels=(found.labels > 0).astype(np.int32), ids=(1,) if found.ids else ())
 

@@ -1,0 +1,53 @@
+"""What a frame shows of its objects together: one that may go on in another is less sure of its sizes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from table_scenes import VGA, Table
+
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.recovery import methods, seen_object
+from sq_perception.segmentation.evidence import FrameEvidence
+
+TABLE = Table()
+
+
+def two_boxes() -> tuple[list[seen_object.SeenObject], Fit]:
+    """A box with one of the same width on it, seen as two objects, and the exact body of the lower one."""
+    lower = TABLE.body(0, 0, (0.05, 0.04, 0.03))
+    upper = TABLE.body(0, 0, (0.05, 0.04, 0.02), height=0.06)
+    depth, labels = TABLE.see([lower, upper])
+    objects = seen_object.objects(depth, FrameEvidence(labels, (1, 2)), VGA)
+    return objects, Fit(lower.canonical_form(), 0.0, Status.CONVERGED, "converged", covariance=1e-6 * np.eye(11))
+
+
+@pytest.mark.parametrize("likely", [0.1, 0.4])
+def test_second_moments_are_those_of_a_body_that_may_reach_over_both(likely: float) -> None:
+    """The stack is 4 cm higher: with probability q half of its height and its centre are 2 cm more along the axis."""
+    (_, upper), fit = two_boxes()
+    found = methods.widened(fit, [(likely, upper)])
+    axis = int(np.abs(fit.superquadric.rotation_matrix.T @ TABLE.plane[:3]).argmax())
+    added = np.diag(found.covariance - fit.covariance)
+    assert added[axis] == pytest.approx(likely * 0.02**2, rel=0.1)
+    assert added[5:8].sum() == pytest.approx(likely * 0.02**2, rel=0.1)
+    assert np.delete(added[:3], axis) == pytest.approx(0, abs=likely * 0.002**2)
+    assert found.status == Status.WEAK
+    assert (np.linalg.eigvalsh(found.covariance) > 0).all()
+
+
+def test_what_lies_within_the_body_and_what_is_surely_another_add_nothing() -> None:
+    (lower, upper), fit = two_boxes()
+    for others in ([(1.0, lower)], [(0.0, upper)], []):
+        found = methods.widened(fit, others)
+        np.testing.assert_allclose(found.covariance, fit.covariance, atol=1e-8)
+        assert found.status == Status.CONVERGED
+
+
+def test_pairs_keep_their_probability_when_others_go() -> None:
+    labels = np.repeat(np.array([[1, 1, 1, 2, 2, 3]], np.int32), 4, axis=0)
+    same = np.array([[0, 0.1, 0.2], [0.1, 0, 0.3], [0.2, 0.3, 0]])
+    found = FrameEvidence(labels, (1, 2, 3), same=same).kept({3: 0.9, 2: 0.8})
+    assert found.ids == (1, 2)
+    assert found.same is not None
+    assert found.same[0, 1] == found.same[1, 0] == 0.3
