@@ -55,9 +55,14 @@ class Recovery:
         return self.fit.superquadric
 
     @property
-    def solids(self) -> tuple[Superquadric, ...]:
+    def fits(self) -> tuple[Fit, ...]:
         """What it looks like: its parts, or its body where it has none."""
-        return (self.superquadric,) if self.parts is None else tuple(fit.superquadric for fit in self.parts)
+        return (self.fit,) if self.parts is None else self.parts.fits
+
+    @property
+    def solids(self) -> tuple[Superquadric, ...]:
+        """The bodies of ``fits``."""
+        return tuple(fit.superquadric for fit in self.fits)
 
     @property
     def residual(self) -> float:
