@@ -31,7 +31,7 @@ of the bodies.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,7 +58,9 @@ from sq_perception.grasping.trials import (
     weight,
 )
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recovery import Recovery
+
+if TYPE_CHECKING:
+    from sq_perception.recovery.recovery import Recovery
 
 FRICTION = 0.5
 """Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
@@ -81,9 +83,10 @@ _LEAST = 0.05
 
 
 def grasps_of(objects: Sequence[Recovery], gripper: Gripper, around: Surroundings, **more: Any) -> GraspPlan:
-    """Plan as :func:`grasps` for the objects of a frame that did not fail, by their parts if they have any."""
-    fits = [fit for one in objects for fit in one.fits]
-    things = np.repeat(np.arange(len(objects)), [len(one.fits) for one in objects])
+    """Plan as :func:`grasps` for the objects of a frame that did not fail, by their parts too if they have any."""
+    fits = [one.fit for one in objects] + [fit for one in objects for fit in one.parts or ()]
+    owner = [k for k, one in enumerate(objects) for _ in one.parts or ()]
+    things = np.array([*range(len(objects)), *owner], dtype=int)
     bodies = Superquadric.stack([fit.superquadric for fit in fits])
     covariance = np.array([fit.covariance for fit in fits]).reshape(-1, 11, 11)
     return grasps(bodies, gripper, covariance, around, things=things, **more)
@@ -113,8 +116,9 @@ def grasps(
     placement
         Standard deviation of the hand's position along each axis, metres: calibration of arm and camera.
     things : int (n,), optional
-        The thing, from 0, that each body is a part of; each body is one if not given.  A part is grasped like a body,
-        clear of the other parts, with the weight of the whole thing.
+        The thing, from 0, of each body; each is one if not given.  The first body of a thing is all of it, others are
+        its parts.  A part is grasped like a body, clear of the other parts, with the weight of the whole thing; in the
+        way of other grasps are the parts, not the body around them.
 
     Raises
     ------
@@ -134,29 +138,32 @@ def grasps(
     known = KnownBodies.of(bodies, covariance)
     things = np.arange(len(bodies)) if things is None else np.asarray(things)
     count = len(np.unique(things))
-    if things.shape != (len(bodies),) or things.dtype.kind not in "iu" or things.min() != 0 or things.max() != count - 1:
+    numbered = things.shape == (len(bodies),) and np.array_equal(np.unique(things), np.arange(count))
+    if not numbered or things.dtype.kind not in "iu":
         raise ValueError(f"things: expected the thing of each of {len(bodies)} bodies, from 0 on, got {things}")
     reasons = np.full(count, f"wider than the opening of {1e3 * gripper.opening:.0f} mm in every direction", object)
     closings = approaches.closings(known, gripper, friction)
-    trials = _trials(known, _loads(bodies, things), closings, gripper, around, friction, placement)
+    whole = np.unique(things, return_index=True)[1][things]
+    whole[np.setdiff1d(whole, np.flatnonzero(np.bincount(things)[things] == 1))] = -1
+    trials = _trials(known, _loads(bodies, things, whole), closings, gripper, around, friction, placement)
     reasons[things[closings.owner]] = "no way for the fingers to come with the table and the palm in their way"
     reasons[np.setdiff1d(things, things[~_behind(known, around.plane)])] = "behind the plane that bodies stand on"
     trials = _narrower(known, trials.first(_CHECKED), gripper, placement)
     trials = _probable(trials, things, _CHECKED, reasons, "nothing holds")
-    trials = _among_others(known, trials, gripper, around, placement)
+    trials = _among_others(known, whole, trials, gripper, around, placement)
     doubtful = np.flatnonzero(~np.isin(things, things[trials.owner[trials.total > np.log(_SURE)]]))
     if len(doubtful):
         rims = at_rims(bodies, doubtful, gripper, around, friction, placement)
-        trials = trials.join(_among_others(known, rims, gripper, around, placement))
+        trials = trials.join(_among_others(known, whole, rims, gripper, around, placement))
     trials = trials._replace(owner=things[trials.owner])
     trials = _probable(trials, np.arange(count), PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
 
 
-def _loads(bodies: Superquadric, things: np.ndarray) -> np.ndarray:
-    """Return the mass of each body's thing and where its centre of mass is, (n, 4): a grasp of a part lifts it all."""
-    mass = DENSITY * np.asarray(bodies.volume())
+def _loads(bodies: Superquadric, things: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return the mass of each body's thing and its centre of mass, (n, 4): a grasp of a part lifts it all."""
+    mass = np.where(whole < 0, 0.0, DENSITY * np.asarray(bodies.volume()))
     of_thing = np.bincount(things, mass)
     moment = np.stack([np.bincount(things, mass * along) for along in bodies.translation.T], axis=1)
     return np.column_stack([of_thing, moment / of_thing[:, None]])[things]
@@ -244,6 +251,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
 
 def _among_others(
     bodies: KnownBodies,
+    whole: np.ndarray,
     trials: Trials,
     gripper: Gripper,
     around: Surroundings,
@@ -253,7 +261,7 @@ def _among_others(
     if not len(trials.owner):
         return trials
     boxes = gripper.boxes_at(trials.opening)
-    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns)
+    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns, whole)
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
     trials.logs[near, 6] = log_passing(gap[near], sigma, placement)

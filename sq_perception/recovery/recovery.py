@@ -16,6 +16,7 @@ import numpy as np
 
 from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recovery.cavities import Cavity
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,8 @@ class Recovery:
         (:mod:`sq_perception.recovery.still_scene`): an answer given before, with the same error.  0: from this frame.
     parts : Parts or None
         The bodies that it is made of, if they were asked for and explain the image better than one body does.
+    cavity : Cavity or None
+        The cavity of an open vessel, if parts were asked for and the camera sees into it.
     """
 
     fit: Fit
@@ -48,6 +51,7 @@ class Recovery:
     objectness: float = 1.0
     repeats: int = 0
     parts: Parts | None = None
+    cavity: Cavity | None = None
 
     @property
     def superquadric(self) -> Superquadric:

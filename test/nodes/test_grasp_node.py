@@ -227,6 +227,21 @@ def test_bodies_are_grasped_however_far_away_the_origin_of_a_map_is(bench):
     assert set(messages.from_message(heard["grasp_details"]).id) == {BOX, CAN}
 
 
+def test_what_is_too_wide_is_taken_by_a_part(bench):
+    """A head as long as the wall, with a handle that points up; parts share its id."""
+    both = np.array([2, 2])
+    parts = replace(
+        bodies().where(both),
+        size=np.array([[0.1, 0.1, 0.05], [0.015, 0.015, 0.05]]),
+        translation=np.array([[0.0, 0.5, 0.05], [0.0, 0.5, 0.15]]),
+        part=np.array([1, 2]),
+    )
+    assert WALL not in messages.from_message(bench.answer(to_message(bodies(), HEADER))["grasp_details"]).id
+    found = messages.from_message(bench.answer(to_message(bodies().followed_by(parts), HEADER))["grasp_details"])
+    assert set(found.id) == {BOX, CAN, WALL}
+    assert (found.position[found.id == WALL, 2] > 0.1).all()
+
+
 def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):
     bench.cloud.publish(PointCloud2(width=3, height=1))
     assert len(bench.answer(to_message(bodies(), Header()))["grasps"].poses) > 0
