@@ -10,6 +10,9 @@ handles      of handled tools, drills and mugs whose handle shows 100 pixels: th
              part, have an IoU of a half
 within 2 s   half sizes of found parts whose pixels are those of one true part (IoU of a half) within two reported
              deviations of that part's half extent along the same axis: of all of it, or of what is not inside others
+cavities     of vessels into whose cavity, 2 cm deep or more, the camera looks 12 degrees or more from above its rim:
+             those that have one; false ones, of all things without a cavity, or whose opening faces away
+depth        median error of the depth of those whose floor is seen, without its sign, mm
 time         scenes of five things: a frame with parts over the same frame without, one after the other, median
 
 Goals over one body: tools + 8, unions + 6, bottles + 4, boxes and cans - 0.2 at worst; taken apart 3 %, handles 80 %,
@@ -28,15 +31,19 @@ import numpy as np
 from common import report
 
 from sq_perception.fitting.fit import Parts, Status
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
+from sq_perception.recovery.cavities import Cavity
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
-from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_table
+from sq_perception.simulation.things_on_table import PlacedThing, ThingsOnTable, things_on_table
 
 SEED, TESTED = 5757, 20_000
 SEEN, SAME = 100, 0.5
+LOOKS_IN, LEAST_DEPTH = 0.2, 0.02
+PERCENT = ("taken apart", "handles", "within 2 s", "cavities", "false cavities")
 HANDLES = {"handled tool": slice(0, 1), "gun": slice(1, 2), "mug": slice(-6, None)}
 """The parts of these families that are the handle."""
 WITH_PARTS = RecoveryOptions(parts=True)
@@ -52,6 +59,23 @@ class Verdict(NamedTuple):
     found: int
     handle: bool | None
     covered: list[bool]
+    depth: float
+    """Of the cavity that the camera sees into, metres; 0: none, NaN: it is shallow, or seen at a grazing angle."""
+    cavity: Cavity | None
+
+
+def depth_seen(placed: PlacedThing) -> float:
+    """As in a verdict."""
+    if placed.thing.kind != "vessel" or not len(placed.thing.cavities):
+        return 0.0
+    low = min(float(hole.translation[2] - hole.size[2]) for hole in placed.thing.cavities)
+    top = max(float(part.translation[2] + part.size[2]) for part in placed.thing.parts)
+    turn = quaternions.to_matrix(placed.rotation)
+    rim = placed.translation + top * turn[:, 2]
+    sine = -float(turn[:, 2] @ rim) / float(np.linalg.norm(rim))
+    if sine <= 0:
+        return 0.0
+    return top - low if sine > LOOKS_IN and top - low > LEAST_DEPTH else float("nan")
 
 
 def seen_scene(kinds: list[str] | None, count: int, seed: list[int]) -> tuple[ThingsOnTable, np.ndarray] | None:
@@ -79,8 +103,9 @@ def verdict(truth: ThingsOnTable, depth: np.ndarray, recoverer: Recoverer) -> Ve
     if not found:
         return None
     body, solids = found[0], list(placed.parts)
+    known = depth_seen(placed), body.cavity
     if body.status == Status.FAILED:
-        return Verdict(0.0, 0.0, len(solids), 1, None, [])
+        return Verdict(0.0, 0.0, len(solids), 1, None, [], *known)
     alone = iou(solids, [body.superquadric])
     mask = truth.labels == placed.label
     shown = np.where(mask, raycast.render(placed.parts, truth.camera)[1], -1)
@@ -88,13 +113,13 @@ def verdict(truth: ThingsOnTable, depth: np.ndarray, recoverer: Recoverer) -> Ve
     of_handle = None if handle is None else np.isin(shown, np.arange(len(solids))[handle])
     is_seen = of_handle is not None and np.count_nonzero(of_handle) >= SEEN
     if body.parts is None:
-        return Verdict(alone, alone, len(solids), 1, False if is_seen else None, [])
+        return Verdict(alone, alone, len(solids), 1, False if is_seen else None, [], *known)
     index = np.where(mask, raycast.render(body.parts.superquadrics, truth.camera)[1], -1)
     pixels = [index == k for k in range(len(body.parts))]
     has_handle = any(_same(of_handle, each) for each in pixels) if is_seen and of_handle is not None else None
     covered = covered_sizes(body.parts, pixels, solids, shown)
     together = iou(solids, list(body.parts.superquadrics))
-    return Verdict(alone, together, len(solids), len(body.parts), has_handle, covered)
+    return Verdict(alone, together, len(solids), len(body.parts), has_handle, covered, *known)
 
 
 def covered_sizes(
@@ -145,6 +170,9 @@ def summary(some: list[Verdict]) -> dict[str, float | None]:
     single = [one.found > 1 for one in some if one.true == 1]
     handles = [one.handle for one in some if one.handle is not None]
     covered = [each for one in some for each in one.covered]
+    cavities = [one.cavity is not None for one in some if one.depth > 0]
+    false = [one.cavity is not None for one in some if one.depth == 0]
+    errors = [1e3 * abs(one.cavity.depth - one.depth) for one in some if one.cavity and one.cavity.sees_floor]
     gain = np.array([one.parts - one.body for one in some])
     return {
         "things": len(some),
@@ -156,6 +184,10 @@ def summary(some: list[Verdict]) -> dict[str, float | None]:
         "taken apart": 100 * float(np.mean(single)) if single else None,
         "handles": 100 * float(np.mean(handles)) if handles else None,
         "handles seen": len(handles),
+        "cavities": 100 * float(np.mean(cavities)) if cavities else None,
+        "cavities seen": len(cavities),
+        "false cavities": 100 * float(np.mean(false)) if false else None,
+        "depth": float(np.nanmedian(errors)) if np.isfinite(errors).any() else None,
         "within 2 s": 100 * float(np.mean(covered)) if covered else None,
     }
 
@@ -163,6 +195,7 @@ def summary(some: list[Verdict]) -> dict[str, float | None]:
 def as_page(results: dict[str, Any]) -> str:
     """The results in Markdown."""
     titles = ("things", "one body", "parts", "gain", "number", "taken apart %", "handles %", "within 2 s %")
+    titles += ("cavities %", "false %", "depth mm")
     lines = ["| kind | " + " | ".join(titles) + " |", "| --- |" + " --- |" * len(titles)]
 
     def cell(value: float | None) -> str:
@@ -171,7 +204,7 @@ def as_page(results: dict[str, Any]) -> str:
     for kind, row in results["kinds"].items():
         gain = f"{row['gain']:+.1f} +- {row['error of the gain']:.1f}"
         cells = [cell(row["things"]), f"{row['one body']:.1f}", f"{row['parts']:.1f}", gain, f"{row['number']:.2f}"]
-        cells += [cell(row[name]) for name in ("taken apart", "handles", "within 2 s")]
+        cells += [cell(row[name]) for name in (*PERCENT, "depth")]
         lines.append(f"| {kind} | " + " | ".join(cells) + " |")
     lines += ["", f"Frames of five things: {results['time']:.2f} times the time of one body a thing."]
     return "\n".join(lines) + "\n"

@@ -44,17 +44,18 @@ from typing import Any
 
 import numpy as np
 from common import picking_scenes, report
-from common.picking_contestants import CONTESTANTS, PEERS, ContactGraspNet, Seen, recoverer_of
+from common.picking_contestants import CONTESTANTS, PEERS, WITH_PARTS, ContactGraspNet, Seen, recoverer_of
 from common.picking_scenes import KINDS, TABLE_CAMERA, THINGS, Scene
 from common.picking_world import Pick, World
 from scipy.stats import binomtest
 
 from sq_perception.grasping.plan import Grasp
-from sq_perception.recovery.recoverer import Recoverer
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
 MOST_ROUNDS = 12
 BOTH = "both"
 ASKED = {"packed": (93, 92), "pile": (80, 70)}
+RIVALS = ("ours without sigma", "ours without the hull", "true bodies", "classic", "cgn in masks", "cgn")
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 _DRAWS = 2000
 _FIRST_SEED = 5000
@@ -76,12 +77,13 @@ def rounds(
 ) -> Iterator[Round]:
     """Image, grasp, pick, until the table is empty or no grasp is found."""
     world = world or scene.world()
+    options = RecoveryOptions(parts=True) if contestant == WITH_PARTS else None
     rng, chance = np.random.default_rng([scene.seed, 1]), np.random.default_rng([scene.seed, 3])
     for _ in range(MOST_ROUNDS):
         if not world.left:
             return
         depth = picking_scenes.observed(world, scene.sensor, rng)
-        seen = Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world, peer, chance.uniform())
+        seen = Seen(depth, recoverer.recover(depth, TABLE_CAMERA, options=options), world, peer, chance.uniform())
         found = CONTESTANTS[contestant](seen)
         if not found:
             return
@@ -267,13 +269,14 @@ def main() -> None:
     parser = report.parser(__doc__)
     parser.add_argument("--scenes", type=int, default=20, help="of each kind")
     parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--things", default="", help="kinds or names, such as tool,mug,bottle; all if empty")
     parser.add_argument("--contestants", default=",".join(CONTESTANTS))
     parser.add_argument("--first", type=int, default=_FIRST_SEED)
     parser.add_argument("--each", type=Path, help="result lines; those that are there are not computed again")
     parser.add_argument("--contact-graspnet", metavar="COMMAND", help="that starts contact_graspnet.py")
     parser.add_argument("--name", default="picking", help="of the results; empty: none are written")
     arguments = parser.parse_args()
-    contestants = arguments.contestants.split(",")
+    contestants, things = arguments.contestants.split(","), list(filter(None, arguments.things.split(",")))
     if not set(contestants) <= {*CONTESTANTS, *PEERS}:
         parser.error(f"--contestants: expected some of {', '.join((*CONTESTANTS, *PEERS))}")
     peer = None
@@ -292,7 +295,7 @@ def main() -> None:
             missing = [name for name in contestants if (kind, seed, name) not in have]
             if not missing:
                 continue
-            scene = picking_scenes.scene(kind, seed)
+            scene = picking_scenes.scene(kind, seed, things)
             for name in missing:
                 line = {"commit": report.commit(), **cleared(scene, name, recoverers[name], peer)}
                 lines.append(line)
@@ -302,9 +305,9 @@ def main() -> None:
                 print(kind, seed, name, line["taken"], [pick["how"] for pick in line["picks"]], line["end"], flush=True)
     found = summary(lines)
     gains = {
-        f"{kind}: ours over {other}": gain(lines, kind, "ours", other)
+        f"{kind}: {name} over {other}": gain(lines, kind, name, other)
         for kind in (*KINDS, BOTH)
-        for other in ("ours without sigma", "ours without the hull", "true bodies", "classic", "cgn in masks", "cgn")
+        for name, other in (*(("ours", other) for other in RIVALS), (WITH_PARTS, "ours"))
     }
     if arguments.name:
         found, gains = _with_earlier(arguments.name, "rows", found), _with_earlier(arguments.name, "gains", gains)

@@ -71,6 +71,8 @@ class Reason(IntFlag):
     HULL = 8
     """No superquadric came near, so that the body was fitted like the convex hull of the object.  If it is WEAK and no
     size is open, some of the object sticks out, a trigger or a spout: keep clear of what was measured there."""
+    CAVITY = 16
+    """The camera sees into an open vessel: it can be taken by its rim."""
 
 
 FIELDS: tuple[tuple[str, int], ...] = tuple(
@@ -154,6 +156,15 @@ class SuperquadricArray(Columns):
     def recovered(self) -> SuperquadricArray:
         """The bodies of objects that did not fail, in their order, without parts."""
         return self.where((self.status != FAILED) & (self.part == 0))
+
+    @property
+    def with_parts(self) -> tuple[SuperquadricArray, np.ndarray]:
+        """The ``recovered`` bodies, then their parts, and whose each row is: positions (n,) in ``recovered``."""
+        whole = self.recovered
+        parts = self.where((self.part > 0) & np.isin(self.id, whole.id))
+        order = np.argsort(whole.id, kind="stable")
+        owner = order[np.searchsorted(whole.id, parts.id, sorter=order)]
+        return whole.followed_by(parts), np.append(np.arange(len(whole)), owner)
 
     def where(self, kept: np.ndarray) -> SuperquadricArray:
         """Those of a mask (n,), in their order."""

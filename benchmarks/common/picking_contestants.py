@@ -3,7 +3,8 @@
 | contestant | bodies | their uncertainty |
 | --- | --- | --- |
 | ours | the recovery | its covariance |
-| ours without sigma | the same | 10 % of the size each |
+| ours with parts | the parts of things that have some | their covariance |
+| ours without sigma | the recovery | 10 % of the size each |
 | ours without the hull | the recovery with the network of bodies, as in release 0.2.0 | its covariance |
 | ours at any score | the same as ours, but the grasp tried is the one whose score is nearest to a random number | |
 | true bodies | the superquadric nearest to the true hull, at the true place | 2.5 mm of the size each |
@@ -102,8 +103,8 @@ class Seen:
 
 
 def ours(seen: Seen) -> tuple[Grasp, ...]:
-    found = seen.recovery.recovered
-    return seen.planned([one.superquadric for one in found], np.array([one.covariance for one in found]))
+    around = Surroundings.of_image(seen.depth, TABLE_CAMERA, seen.recovery.plane)
+    return planner.grasps_of(seen.recovery.recovered, GRIPPER, around).grasps
 
 
 def without_sigma(seen: Seen) -> tuple[Grasp, ...]:
@@ -184,10 +185,11 @@ def cgn_in_masks(seen: Seen) -> tuple[Grasp, ...]:
     return tuple(grasp for grasp, row, column in seen.peer.found(seen.depth) if labels[row, column] > 0)
 
 
-# What "ours without the hull" and "classic" have of their own is their recovery: recoverer_of.
+# What "ours with parts", "ours without the hull" and "classic" have of their own is their recovery: recoverer_of.
 CONTESTANTS: dict[str, Callable[[Seen], tuple[Grasp, ...]]] = {
     "ours": ours,
     "ours without sigma": without_sigma,
+    "ours with parts": ours,
     "ours without the hull": ours,
     "ours at any score": at_any_score,
     "true bodies": true_bodies,
@@ -197,7 +199,8 @@ CONTESTANTS: dict[str, Callable[[Seen], tuple[Grasp, ...]]] = {
     "cgn in masks": cgn_in_masks,
     "cgn": cgn,
 }
-ON_RECOVERED = ("ours", "ours without sigma", "ours without the hull", "ours at any score", "classic")
+WITH_PARTS = "ours with parts"
+ON_RECOVERED = ("ours", WITH_PARTS, "ours without sigma", "ours without the hull", "ours at any score", "classic")
 PEERS = ("cgn in masks", "cgn")
 
 

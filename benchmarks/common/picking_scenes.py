@@ -16,6 +16,7 @@ once a scene.  The fingers push with 30 N, which a carton bears.  The world's fr
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +27,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, move
 from sq_perception.grasping.gripper import PANDA
-from sq_perception.simulation import sensor_noise
+from sq_perception.simulation import household, sensor_noise
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing import NO_CAVITY, ON_X, ON_Y, UPRIGHT
@@ -82,11 +83,11 @@ class Scene:
         return quaternions.to_matrix(off) @ position + shift, quaternions.multiply(off, rotation)
 
 
-def scene(kind: str, seed: int) -> Scene:
-    """The scene of this number; the same every time."""
+def scene(kind: str, seed: int, things: Sequence[str] = ()) -> Scene:
+    """The scene of this number, of these kinds or names of things, each as often; the same every time."""
     rng = np.random.default_rng([KINDS.index(kind), seed])
     while True:
-        found = _packed(rng) if kind == "packed" else _pile(rng)
+        found = _packed(rng, things) if kind == "packed" else _pile(rng, things)
         if found is not None:
             return Scene(kind, seed, *found)
 
@@ -118,9 +119,12 @@ def to_world(position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np
     return quaternions.to_matrix(back) @ (position - EYE), quaternions.multiply(back, rotation)
 
 
-def _thing(rng: np.random.Generator, packed: bool) -> Thing:
+def _thing(rng: np.random.Generator, packed: bool, things: Sequence[str]) -> Thing:
+    wanted = things[rng.integers(len(things))] if things else ""
     while True:
-        drawn = draw_thing(rng)
+        drawn = draw_thing(rng, [wanted] if wanted in household.KINDS else None)
+        if wanted not in ("", drawn.kind, drawn.name):
+            continue
         cavity = drawn.cavities[:1] if drawn.kind == "vessel" else NO_CAVITY
         thing = Thing(drawn.parts, rng.uniform(*_FRICTION), drawn.name, cavity)
         turn = UPRIGHT
@@ -150,10 +154,10 @@ def _points(thing: Thing, turn: np.ndarray) -> np.ndarray:
 Poses = tuple[tuple[Thing, ...], np.ndarray, np.ndarray]
 
 
-def _packed(rng: np.random.Generator) -> Poses | None:
+def _packed(rng: np.random.Generator, wanted: Sequence[str]) -> Poses | None:
     things, flats, positions, rotations = [], [], [], []
     for _ in range(THINGS):
-        thing = _thing(rng, packed=True)
+        thing = _thing(rng, True, wanted)
         angle = rng.uniform(0, np.pi)
         turn = np.array([0.0, 0.0, np.sin(angle), np.cos(angle)])
         low = -float(flat_support(thing.parts.to_flat(), np.array([[0, 0, -1.0]]))[0])
@@ -172,8 +176,8 @@ def _packed(rng: np.random.Generator) -> Poses | None:
     return _settled(things, positions, rotations)
 
 
-def _pile(rng: np.random.Generator) -> Poses | None:
-    things = [_thing(rng, packed=False) for _ in range(THINGS)]
+def _pile(rng: np.random.Generator, wanted: Sequence[str]) -> Poses | None:
+    things = [_thing(rng, False, wanted) for _ in range(THINGS)]
     world = World(things, GRIPPER, walls=HALF)
     for k in range(THINGS):
         at = np.array([*rng.uniform(-0.3 * HALF, 0.3 * HALF, 2), 0.3])

@@ -41,6 +41,7 @@ def main(arguments: Sequence[str]) -> int:
     add = command.add_argument
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     add("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
+    add("--parts", action="store_true", help="grasp objects of several bodies by their parts: handles, necks, stems")
     add("--friction", type=positive, help="smallest friction coefficient between pads and objects (default 0.5)")
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
     add("--topic", metavar="TOPIC", help="depth topic of a bag, if it has several")

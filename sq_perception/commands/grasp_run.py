@@ -114,16 +114,14 @@ def _bodies(
     stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
     """Return a frame's element ``bodies``, numbered as by ``recover``; write its picture and mesh if requested."""
-    settings = RecoveryOptions(free_space=frame.has_free_space)
+    settings = RecoveryOptions(free_space=frame.has_free_space, parts=options.parts)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:
         complain(f"{frame.name}: {recovery.message}")
     found = recovery.recovered
     numbers = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
-    bodies = Superquadric.stack([recovered.superquadric for recovered in found])
-    covariance = np.array([recovered.covariance for recovered in found]).reshape(-1, 11, 11)
     around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)
-    plan = planner.grasps(bodies, hand, covariance, around, friction)
+    plan = planner.grasps_of(found, hand, around, friction=friction)
     if options.pictures:
         _draw(options.pictures / f"{stem}.png", frame, found, numbers, plan, hand)
     if options.meshes and found:
@@ -163,9 +161,9 @@ def _draw(
 
 def _write_mesh(path: Path, found: Sequence[Recovery], numbers: Sequence[int], plan: GraspPlan, hand: Gripper) -> None:
     """Write the bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
-    solids = [recovered.superquadric for recovered in found]
-    names = [f"body_{k}" for k in numbers]
-    owner = list(numbers)
+    shown = [(k, solid) for k, recovered in zip(numbers, found, strict=True) for solid in recovered.solids]
+    owner, solids = [k for k, _ in shown], [solid for _, solid in shown]
+    names = [f"body_{k}" for k in owner]
     for place, k in enumerate(numbers):
         for grasp in plan.of(place)[:1]:
             boxes = hand.boxes(grasp.opening, reach=0.0)

@@ -90,7 +90,7 @@ def minimize(
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        _hold(parameters, lower, upper, sums[STEP_LENGTH], held)
+        hold(parameters, lower, upper, sums[STEP_LENGTH], held)
         accepted = False
         for _ in range(_ATTEMPTS):
             if solve_damped(sums, damping, held, factor, step):
@@ -125,7 +125,7 @@ def _promised(sums: np.ndarray, step: np.ndarray) -> float:
 
 
 @kernel
-def _hold(parameters: np.ndarray, lower: np.ndarray, upper: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> None:
+def hold(parameters: np.ndarray, lower: np.ndarray, upper: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> None:
     """Mark the parameters that sit on a bound and would be pushed beyond it."""
     for k in range(PARAMETERS):
         entry = k if k < 8 else k + 3

@@ -24,16 +24,14 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from sq_perception.fitting.levenberg_marquardt import STEP_LENGTH, hold, move, solve_damped
 from sq_perception.geometry.kernels import gauge_derivatives, in_object_frame, inline_kernel, kernel
 
 Body: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
-STEP_LENGTH = 13
 BODY_LENGTH = 10
 _LANES = 64
 _TINY = 1e-12
 """Added to a squared gradient to keep divisions by it finite."""
-_LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
-"""Largest changes in one step, those of exponents and tapers alike; a shift is limited to the largest half size."""
 _ATTEMPTS = 5
 """Refused steps in a row, damping growing 10^4 fold, before the search ends."""
 
@@ -173,65 +171,6 @@ def normal_equations(
 
 
 @kernel
-def _solve(sums: np.ndarray, damping: float, held: np.ndarray, factor: np.ndarray, step: np.ndarray) -> bool:
-    """Cholesky solution of the damped normal equations; False where they are not positive."""
-    for i in range(STEP_LENGTH):
-        for j in range(i + 1):
-            entry = sums[i, j]
-            if i == j:
-                entry = entry * (1.0 + damping) + 1e-3
-            if held[i] or held[j]:
-                entry = 1.0 if i == j else 0.0
-            for k in range(j):
-                entry -= factor[i, k] * factor[j, k]
-            if i == j:
-                if not entry > 1e-300:
-                    return False
-                factor[i, i] = math.sqrt(entry)
-            else:
-                factor[i, j] = entry / factor[j, j]
-    for i in range(STEP_LENGTH):
-        entry = 0.0 if held[i] else -sums[STEP_LENGTH, i]
-        for k in range(i):
-            entry -= factor[i, k] * step[k]
-        step[i] = entry / factor[i, i]
-    for i in range(STEP_LENGTH - 1, -1, -1):
-        entry = step[i]
-        for k in range(i + 1, STEP_LENGTH):
-            entry -= factor[k, i] * step[k]
-        step[i] = entry / factor[i, i]
-    return True
-
-
-@kernel
-def _moved(body: np.ndarray, m: np.ndarray, step: np.ndarray, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
-    """The body and its rotation after a step, clipped."""
-    size = max(body[0], body[1], body[2])
-    new, turned = body.copy(), m.copy()
-    for k in range(8):
-        most = _LONGEST_LOG_SIZE if k < 3 else (_LONGEST_SHAPE if k < 5 else size)
-        change = min(max(step[k], -most), most)
-        new[k] = body[k] * math.exp(change) if k < 3 else body[k] + change
-    for k in range(2):
-        new[8 + k] = body[8 + k] + min(max(step[11 + k], -_LONGEST_SHAPE), _LONGEST_SHAPE)
-    for k in range(BODY_LENGTH):
-        new[k] = min(max(new[k], prior.lower[k]), prior.upper[k])
-    x, y, z = step[8], step[9], step[10]
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle > 1e-12:
-        turn = min(angle, _LONGEST_TURN)
-        x, y, z = x / angle, y / angle, z / angle
-        s, c = math.sin(turn), 1.0 - math.cos(turn)
-        for i in range(3):  # R exp([w]) by Rodrigues, row by row
-            r1, r2, r3 = m[i, 0], m[i, 1], m[i, 2]
-            p1, p2, p3 = r2 * z - r3 * y, r3 * x - r1 * z, r1 * y - r2 * x
-            turned[i, 0] = r1 + s * p1 + c * (p2 * z - p3 * y)
-            turned[i, 1] = r2 + s * p2 + c * (p3 * x - p1 * z)
-            turned[i, 2] = r3 + s * p3 + c * (p1 * y - p2 * x)
-    return new, turned
-
-
-@kernel
 def improve(
     points: np.ndarray,
     offsets: np.ndarray,
@@ -249,21 +188,15 @@ def improve(
     factor = np.zeros((STEP_LENGTH, STEP_LENGTH))
     step = np.zeros(STEP_LENGTH)
     held = np.zeros(STEP_LENGTH, dtype=np.bool_)
+    body, m, new, turned = body.copy(), m.copy(), body.copy(), m.copy()
     cost = normal_equations(points, offsets, sides, weights, body, m, prior, sums)
     damping = 1e-3
     for _ in range(steps):
-        for k in range(STEP_LENGTH):
-            at = k if k < 8 else k - 3
-            held[k] = False
-            if k < 8 or k > 10:
-                gradient = sums[STEP_LENGTH, k]
-                is_low = body[at] <= prior.lower[at] + 1e-12 and gradient > 0.0
-                held[k] = is_low or (body[at] >= prior.upper[at] - 1e-12 and gradient < 0.0)
+        hold(body, prior.lower, prior.upper, sums[STEP_LENGTH], held)
         accepted = False
-        gain = 0.0
         for _ in range(_ATTEMPTS):
-            if _solve(sums, damping, held, factor, step):
-                new, turned = _moved(body, m, step, prior)
+            if solve_damped(sums, damping, held, factor, step):
+                move(body, m, step, prior.lower, prior.upper, new, turned)
                 new_cost = normal_equations(points, offsets, sides, weights, new, turned, prior, next_sums)
                 if new_cost < cost:
                     accepted = True
@@ -272,7 +205,9 @@ def improve(
         if not accepted:
             break
         gain = cost - new_cost
-        body, m, cost = new, turned, new_cost
+        cost = new_cost
+        body, new = new, body
+        m, turned = turned, m
         sums, next_sums = next_sums, sums
         damping = max(0.1 * damping, 1e-9)
         if gain <= tolerance * abs(cost):

@@ -37,7 +37,7 @@ from sq_perception.geometry.support_directions import DIRECTIONS
 
 MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
-_STAGES = ((400, 4, 24), (800, 8, 4))
+_STAGES = ((200, 3, 24), (400, 8, 3))
 """Points, rounds and most bodies of each stage of the search."""
 _COARSE = 0.02
 """Least noise of the search, in radii of the cloud: a part that is a perfect superquadric is not the whole thing."""

@@ -30,7 +30,7 @@ _STRAY = 3
 
 @kernel
 def gaps_to_bodies(
-    frames: np.ndarray, boxes: np.ndarray, owner: np.ndarray, flat: np.ndarray, turns: np.ndarray
+    frames: np.ndarray, boxes: np.ndarray, owner: np.ndarray, flat: np.ndarray, turns: np.ndarray, whole: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return each gripper's least gap (k,) to other bodies, that body's index (-1: none within reach), and n.
 
@@ -46,6 +46,8 @@ def gaps_to_bodies(
         The body that each is to grasp.
     flat, turns : (n, 14), (n, 3, 3)
         Flat parameters with tapers, and rotation matrices of the bodies.
+    whole : int (n,)
+        The body that each is a part of, itself if of none; -1 for a body of parts, in whose place these are.
     """
     least = np.full(len(frames), FAR)
     which = np.full(len(frames), -1)
@@ -54,7 +56,7 @@ def gaps_to_bodies(
     for k in range(len(frames)):
         frame = frames[k]
         for body in range(len(flat)):
-            if body == owner[k]:
+            if body == owner[k] or whole[body] == owner[k] or whole[body] < 0:
                 continue
             size = _half(flat[body])
             radius = math.sqrt(size[0] ** 2 + size[1] ** 2 + size[2] ** 2)

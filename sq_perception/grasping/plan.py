@@ -19,7 +19,7 @@ class Grasp:
     Attributes
     ----------
     body
-        Position of its body in the batch.
+        Position of its body in the batch, or the number of its thing where bodies are parts of things.
     position, rotation : (3,), (4,)
         Pose of the TCP in the frame of the bodies; the rotation is a quaternion x y z w.
     opening

@@ -1,4 +1,4 @@
-"""Grasps of every body, best first, each with the probability that it holds.
+"""Grasps of every body or its parts, best first, each with the probability that it holds.
 
     P = product over k of Phi(m_k / sigma_k)
 
@@ -30,7 +30,8 @@ of the bodies.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -58,6 +59,9 @@ from sq_perception.grasping.trials import (
 )
 from sq_perception.imaging.camera import Camera
 
+if TYPE_CHECKING:
+    from sq_perception.recovery.recovery import Recovery
+
 FRICTION = 0.5
 """Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
 _AT_MOST = 2.0
@@ -78,6 +82,16 @@ _LEAST = 0.05
 """Probability below which grasps are not returned."""
 
 
+def grasps_of(objects: Sequence[Recovery], gripper: Gripper, around: Surroundings, **more: Any) -> GraspPlan:
+    """Plan as :func:`grasps` for the objects of a frame that did not fail, by their parts too if they have any."""
+    fits = [one.fit for one in objects] + [fit for one in objects for fit in one.parts or ()]
+    owner = [k for k, one in enumerate(objects) for _ in one.parts or ()]
+    things = np.array([*range(len(objects)), *owner], dtype=int)
+    bodies = Superquadric.stack([fit.superquadric for fit in fits])
+    covariance = np.array([fit.covariance for fit in fits]).reshape(-1, 11, 11)
+    return grasps(bodies, gripper, covariance, around, things=things, **more)
+
+
 def grasps(
     bodies: Superquadric,
     gripper: Gripper,
@@ -85,8 +99,9 @@ def grasps(
     around: Surroundings | None = None,
     friction: float = FRICTION,
     placement: float = PLACEMENT,
+    things: np.ndarray | None = None,
 ) -> GraspPlan:
-    """Plan grasps of some bodies, with the reason for those that have none.
+    """Plan grasps of some things, with the reason for those that have none.
 
     Parameters
     ----------
@@ -100,12 +115,16 @@ def grasps(
         Smallest mu between pads and bodies: the friction cone is that of mu to twice mu, weights assume mu.
     placement
         Standard deviation of the hand's position along each axis, metres: calibration of arm and camera.
+    things : int (n,), optional
+        The thing, from 0, of each body; each is one if not given.  The first body of a thing is all of it, others are
+        its parts.  A part is grasped like a body, clear of the other parts, with the weight of the whole thing; in the
+        way of other grasps are the parts, not the body around them.
 
     Raises
     ------
     ValueError
-        If the bodies are no batch, arrays do not belong to them, the friction is not positive, or the placement is
-        negative.
+        If the bodies are no batch, arrays do not belong to them, the friction is not positive, the placement is
+        negative, or a thing has no body.
     """
     if len(bodies.batch_shape) != 1:
         raise ValueError(f"bodies: expected a batch (n,), got {bodies.batch_shape}")
@@ -117,23 +136,37 @@ def grasps(
         return GraspPlan()
     around = around or Surroundings()
     known = KnownBodies.of(bodies, covariance)
-    reasons = np.array(
-        [f"wider than the opening of {1e3 * gripper.opening:.0f} mm in every direction"] * len(bodies), dtype=object
-    )
+    things = np.arange(len(bodies)) if things is None else np.asarray(things)
+    count = len(np.unique(things))
+    numbered = things.shape == (len(bodies),) and np.array_equal(np.unique(things), np.arange(count))
+    if not numbered or things.dtype.kind not in "iu":
+        raise ValueError(f"things: expected the thing of each of {len(bodies)} bodies, from 0 on, got {things}")
+    reasons = np.full(count, f"wider than the opening of {1e3 * gripper.opening:.0f} mm in every direction", object)
     closings = approaches.closings(known, gripper, friction)
-    trials = _trials(known, bodies.volume(), closings, gripper, around, friction, placement)
-    reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
-    reasons[_behind(known, around.plane)] = "behind the plane that bodies stand on"
+    whole = np.unique(things, return_index=True)[1][things]
+    whole[np.setdiff1d(whole, np.flatnonzero(np.bincount(things)[things] == 1))] = -1
+    trials = _trials(known, _loads(bodies, things, whole), closings, gripper, around, friction, placement)
+    reasons[things[closings.owner]] = "no way for the fingers to come with the table and the palm in their way"
+    reasons[np.setdiff1d(things, things[~_behind(known, around.plane)])] = "behind the plane that bodies stand on"
     trials = _narrower(known, trials.first(_CHECKED), gripper, placement)
-    trials = _probable(trials, _CHECKED, reasons, "nothing holds")
-    trials = _among_others(known, trials, gripper, around, placement)
-    doubtful = np.setdiff1d(np.arange(len(bodies)), trials.owner[trials.total > np.log(_SURE)])
+    trials = _probable(trials, things, _CHECKED, reasons, "nothing holds")
+    trials = _among_others(known, whole, trials, gripper, around, placement)
+    doubtful = np.flatnonzero(~np.isin(things, things[trials.owner[trials.total > np.log(_SURE)]]))
     if len(doubtful):
         rims = at_rims(bodies, doubtful, gripper, around, friction, placement)
-        trials = trials.join(_among_others(known, rims, gripper, around, placement))
-    trials = _probable(trials, PER_BODY, reasons, "in the way")
+        trials = trials.join(_among_others(known, whole, rims, gripper, around, placement))
+    trials = trials._replace(owner=things[trials.owner])
+    trials = _probable(trials, np.arange(count), PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
+
+
+def _loads(bodies: Superquadric, things: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Return the mass of each body's thing and its centre of mass, (n, 4): a grasp of a part lifts it all."""
+    mass = np.where(whole < 0, 0.0, DENSITY * np.asarray(bodies.volume()))
+    of_thing = np.bincount(things, mass)
+    moment = np.stack([np.bincount(things, mass * along) for along in bodies.translation.T], axis=1)
+    return np.column_stack([of_thing, moment / of_thing[:, None]])[things]
 
 
 def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
@@ -144,10 +177,11 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
     return np.asarray(bodies.middle @ plane[:3] + top + plane[3] < 0)
 
 
-def _probable(trials: Trials, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """Return each body's ``count`` best grasps; for the others, the best one's weakest margin as the reason."""
+def _probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:
+    """Return each body's ``count`` best grasps; for things without any, the best one's weakest margin as the reason."""
     found = trials.first(count, np.log(_LEAST))
-    without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
+    without = trials.at(~np.isin(things[trials.owner], things[found.owner]))
+    without = without._replace(owner=things[without.owner]).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
         reasons[k] = f"{why}: {MARGINS[weakest]}"
     return found
@@ -163,7 +197,7 @@ def warm_up() -> None:
 
 def _trials(
     bodies: KnownBodies,
-    volume: np.ndarray,
+    loads: np.ndarray,
     found: Closings,
     gripper: Gripper,
     around: Surroundings,
@@ -178,7 +212,8 @@ def _trials(
     ways, u, angle = every.at(places.of), places.ahead, places.angle
     owner, (turn, centre) = ways.owner, np.split(ways.frames, [3], axis=2)
     aside = np.nan_to_num(0.5 * (places.ends[:, 0] - places.ends[:, 1])) + ways.shift
-    lever = np.abs((places.offset * ways.tilting).sum(axis=1))
+    beside = bodies.middle[owner] + places.offset - loads[owner, 1:]
+    lever = np.abs((beside * ways.tilting).sum(axis=1))
     offset = places.offset + aside[:, None] * turn[:, :, 1]
     frames = np.concatenate([turn, centre + offset[:, :, None]], axis=2)
 
@@ -191,7 +226,7 @@ def _trials(
     logs[:, 1] = log_phi(u + gripper.tip + ways.near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - ways.near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)
-    logs[:, 4] = weight(DENSITY * volume[owner], lever, 2 * friction * gripper.force)
+    logs[:, 4] = weight(loads[owner, 0], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
         logs[:, 5] = log_phi(ways.height + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
     return Trials(owner, frames, ways.opening, 2 * ways.reach, logs, sides)
@@ -216,6 +251,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
 
 def _among_others(
     bodies: KnownBodies,
+    whole: np.ndarray,
     trials: Trials,
     gripper: Gripper,
     around: Surroundings,
@@ -225,7 +261,7 @@ def _among_others(
     if not len(trials.owner):
         return trials
     boxes = gripper.boxes_at(trials.opening)
-    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns)
+    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns, whole)
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
     trials.logs[near, 6] = log_passing(gap[near], sigma, placement)

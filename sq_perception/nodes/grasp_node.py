@@ -211,8 +211,9 @@ class GraspNode(ManagedNode):
         try:
             if message.header.frame_id == CUBE_FRAME:
                 raise ValueError("views of the unit cube have no metres to grasp in")
-            bodies = from_message(message).recovered
-            planned = plan(bodies, self._settings.current, self._plane_in(message.header))
+            array = from_message(message)
+            bodies = array.recovered
+            planned = plan(array, self._settings.current, self._plane_in(message.header))
             with self._publishing:
                 if not self._outputs:  # deactivated while it was planned
                     return None, f"the node is {self.state}"
@@ -249,11 +250,12 @@ class GraspNode(ManagedNode):
         return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replace_markers(ids))
 
 
-def plan(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
-    """Plan grasps as the parameters say; excluded bodies are obstacles without grasps."""
+def plan(array: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
+    """Plan grasps of recovered objects as the parameters say; excluded ones are obstacles without grasps."""
+    bodies, (rows, things) = array.recovered, array.with_parts
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement
-    plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)
+    plan = grasps(superquadrics(rows), hand, covariances(rows), Surroundings(plane), friction, placement, things)
     wanted = (parameters.only_id == -1) | (bodies.id == parameters.only_id)
     if (box := parameters.box) is not None:
         wanted = wanted & np.all((bodies.translation >= box[:3]) & (bodies.translation <= box[3:]), axis=1)

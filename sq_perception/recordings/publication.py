@@ -29,12 +29,12 @@ from sq_msgs_py.markers import Mesh as MarkerMesh
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
 from sq_perception.fitting.covariance import undetermined
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import compressed_depth, depth_units, unit_cube
 from sq_perception.imaging.depth_units import Metres, Stated
-from sq_perception.recovery.recovery import FrameRecovery, edges_as_text
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, edges_as_text
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
 
 CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
@@ -99,7 +99,7 @@ def identify(
     Without tracks bodies are the frame's, and ids their labels.
     """
     if tracks is None:
-        reasons = tuple(_reason(body.fit, body.superquadric) for body in recovery.bodies)
+        reasons = tuple(_reason(body, body.superquadric) for body in recovery.bodies)
         return Identified(recovery, tuple(body.label for body in recovery.bodies), columns={"reason": reasons})
     left = iter(tracks)
     bodies, known = [], []
@@ -112,15 +112,16 @@ def identify(
         bodies.append(
             replace(body, fit=replace(body.fit, superquadric=track.superquadric, covariance=track.covariance))
         )
-        known.append((track.id, track.seen, track.is_fused, _reason(body.fit, track.superquadric)))
+        known.append((track.id, track.seen, track.is_fused, _reason(body, track.superquadric)))
     ids, *columns = zip(*known, strict=True) if known else ((), (), (), ())
     names = ("seen", "fused", "reason")
     return Identified(replace(recovery, bodies=tuple(bodies)), ids, hidden, dict(zip(names, columns, strict=True)))
 
 
-def _reason(fit: Fit, shown: Superquadric) -> int:
+def _reason(body: Recovery, shown: Superquadric) -> int:
     """The reason that a fit gives for its status, by the axes of the body that is shown in its place."""
-    reason = Reason.HULL if fit.as_hull else Reason(0)
+    fit = body.fit
+    reason = (Reason.HULL if fit.as_hull else Reason(0)) | (Reason(0) if body.cavity is None else Reason.CAVITY)
     if fit.status == Status.WEAK:
         partner = np.abs(shown.rotation_matrix.T @ fit.superquadric.rotation_matrix).argmax(axis=1)
         is_open = undetermined(fit.covariance, fit.superquadric.size)[partner]
@@ -216,10 +217,10 @@ def _take_parts(found: Identified) -> Identified:
     columns: dict[str, list[int]] = {"seen": [], "reason": [], "part": []}
     for k, body in enumerate(found.recovery.bodies):
         for number, fit in enumerate(body.parts or (), 1):
-            bodies.append(replace(body, fit=fit, score=np.nan, parts=None))
+            bodies.append(replace(body, fit=fit, score=np.nan, parts=None, cavity=None))
             ids.append(found.ids[k])
             columns["seen"].append(found.columns["seen"][k] if "seen" in found.columns else 0)
-            columns["reason"].append(_reason(fit, fit.superquadric))
+            columns["reason"].append(_reason(bodies[-1], fit.superquadric))
             columns["part"].append(number)
     known = {name: tuple(values) for name, values in columns.items()}
     return Identified(replace(found.recovery, bodies=tuple(bodies)), tuple(ids), columns=known)

@@ -16,6 +16,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,7 @@ def frame_entry(
                 "objectness": body.objectness,
                 "track": None if track is None else _track_entry(track, frame.is_cube),
                 "parts": _part_entries(body.parts, frame.is_cube),
+                "cavity": None if body.cavity is None else asdict(body.cavity),
             }
         )
     entry = {

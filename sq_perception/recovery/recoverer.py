@@ -43,6 +43,7 @@ from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import methods, parts, prediction, seen_object, supports
+from sq_perception.recovery.cavities import find_cavity
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
@@ -278,12 +279,16 @@ class Recoverer:
             made_of = self._find_parts(fresh, fits, depth, readings, network, deadline)
             fitted = time.perf_counter()
 
+            cavities = [
+                find_cavity(obj, (fit,) if some is None else some.fits) if options.parts else None
+                for obj, fit, some in zip(fresh, fits, made_of, strict=True)
+            ]
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
         segmentation = found.segmentation
         likely = segmentation.likely()
         recovered = {
-            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely[obj.label], parts=some)
-            for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True)
+            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely[obj.label], parts=some, cavity=cavity)
+            for obj, fit, score, some, cavity in zip(fresh, fits, scores, made_of, cavities, strict=True)
         }
         bodies = tuple(known[obj.label] if obj.label in known else recovered[obj.label] for obj in found.objects)
         scored = time.perf_counter()

@@ -16,6 +16,7 @@ import numpy as np
 
 from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recovery.cavities import Cavity
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +40,8 @@ class Recovery:
         (:mod:`sq_perception.recovery.still_scene`): an answer given before, with the same error.  0: from this frame.
     parts : Parts or None
         The bodies that it is made of, if they were asked for and explain the image better than one body does.
+    cavity : Cavity or None
+        The cavity of an open vessel, if parts were asked for and the camera sees into it.
     """
 
     fit: Fit
@@ -48,6 +51,7 @@ class Recovery:
     objectness: float = 1.0
     repeats: int = 0
     parts: Parts | None = None
+    cavity: Cavity | None = None
 
     @property
     def superquadric(self) -> Superquadric:
@@ -55,9 +59,14 @@ class Recovery:
         return self.fit.superquadric
 
     @property
-    def solids(self) -> tuple[Superquadric, ...]:
+    def fits(self) -> tuple[Fit, ...]:
         """What it looks like: its parts, or its body where it has none."""
-        return (self.superquadric,) if self.parts is None else tuple(fit.superquadric for fit in self.parts)
+        return (self.fit,) if self.parts is None else self.parts.fits
+
+    @property
+    def solids(self) -> tuple[Superquadric, ...]:
+        """The bodies of ``fits``."""
+        return tuple(fit.superquadric for fit in self.fits)
 
     @property
     def residual(self) -> float:

@@ -202,6 +202,41 @@ def test_a_width_that_may_be_less_is_tried_and_doubted():
     assert found[0].score < 0.5
 
 
+def hammer(half_head=0.06):
+    """A hammer on the table: the body around it, its handle along x and its head across the end."""
+    handle = Superquadric([0.09, 0.014, 0.014], [0.2, 0.2], [0.0, 0.0, 0.02], UPRIGHT)
+    head = Superquadric([0.02, half_head, 0.02], [0.2, 0.2], [0.11, 0.0, 0.02], UPRIGHT)
+    return Superquadric([0.11, half_head, 0.02], [0.2, 0.2], [0.02, 0.0, 0.02], UPRIGHT), handle, head
+
+
+def test_what_is_too_wide_is_taken_by_its_handle_near_its_middle():
+    body, handle, head = hammer()
+    assert not plan(body).grasps
+    found = plan(body, handle, head, things=np.zeros(3, int))
+    assert found.reasons == ("",)
+    assert {grasp.body for grasp in found.grasps} == {0}
+    best = found.grasps[0]
+    assert abs(plan(handle).grasps[0].position[0]) < 0.01
+    assert best.position[0] > 0.025  # nearer to the middle of all of its mass
+    assert best.position[0] + 0.5 * PANDA.finger_width < head.translation[0] - head.size[0]
+    assert abs(closing_line(best)[1]) > 0.9
+
+
+def test_the_body_around_parts_is_in_nobodys_way():
+    """A ball stands in the corner of a hammer, where the body around the hammer is and none of its parts."""
+    body, handle, head = hammer()
+    ball = standing([0.015] * 3, [1.0, 1.0], x=-0.01, y=0.055)
+    things = np.array([0, 1, 0, 0])
+    assert {grasp.body for grasp in plan(body, ball).grasps} == set()
+    assert {grasp.body for grasp in plan(body, ball, handle, head, things=things).grasps} == {0, 1}
+
+
+@pytest.mark.parametrize("things", [[0, 0], [0, 2, 2], [1, 1, 1], [0.0, 0.0, 0.0]])
+def test_parts_of_no_thing_are_refused(things):
+    with pytest.raises(ValueError, match="things: expected"):
+        plan(*hammer(), things=np.array(things))
+
+
 def test_gaps_to_spheres_and_depths_of_points():
     """One finger-sized box at the origin: the gap to a sphere is known along any axis, a point's depth inside too."""
     frame = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)[None]
@@ -210,7 +245,7 @@ def test_gaps_to_spheres_and_depths_of_points():
         corner = np.array([0.0, 0.02, 0.03]) if half is None else half * way
         ball = Superquadric.stack([Superquadric([0.02] * 3, [1.0, 1.0], corner + 0.03 * way, UPRIGHT)])
         gap, which, found = clearance.gaps_to_bodies(
-            frame, box, np.array([-1]), ball.to_flat(), np.ascontiguousarray(ball.rotation_matrix)
+            frame, box, np.array([-1]), ball.to_flat(), np.ascontiguousarray(ball.rotation_matrix), np.zeros(1, int)
         )
         assert which[0] == 0
         assert gap[0] == pytest.approx(0.01, abs=1e-4)

@@ -230,6 +230,21 @@ def test_bodies_are_grasped_however_far_away_the_origin_of_a_map_is(bench):
     assert set(messages.from_message(heard["grasp_details"]).id) == {BOX, CAN}
 
 
+def test_what_is_too_wide_is_taken_by_a_part(bench):
+    """A head as long as the wall, with a handle that points up; parts share its id."""
+    both = np.array([2, 2])
+    parts = replace(
+        bodies().where(both),
+        size=np.array([[0.1, 0.1, 0.05], [0.015, 0.015, 0.05]]),
+        translation=np.array([[0.0, 0.5, 0.05], [0.0, 0.5, 0.15]]),
+        part=np.array([1, 2]),
+    )
+    assert WALL not in messages.from_message(bench.answer(to_message(bodies(), HEADER))["grasp_details"]).id
+    found = messages.from_message(bench.answer(to_message(bodies().followed_by(parts), HEADER))["grasp_details"])
+    assert set(found.id) == {BOX, CAN, WALL}
+    assert (found.position[found.id == WALL, 2] > 0.1).all()
+
+
 def test_a_cloud_that_is_planned_while_the_node_is_deactivated_is_dropped(bench, monkeypatch):
     """Deactivated between the plan and its publication: no refusal, no grasps, and the next activation answers."""
     planned, said = grasp_node.plan, []

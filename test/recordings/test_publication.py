@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from std_msgs.msg import Header
@@ -11,6 +13,7 @@ from sq_msgs_py.superquadrics import FAILED, WEAK, Reason
 from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.recordings import publication
+from sq_perception.recovery.cavities import Cavity
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 from sq_perception.tracking.session import Followed
 
@@ -42,6 +45,10 @@ def test_a_weak_body_names_the_axis_that_is_open():
     assert Reason(int(reason)) == Reason.OPEN_Y
     (reason,) = array(publication.identify(recovery(Status.WEAK, as_hull=True))).reason
     assert Reason(int(reason)) == Reason.OPEN_Y | Reason.HULL
+    cavity = Cavity(np.zeros(3), np.array([0.0, 0.0, -1.0]), np.full(2, 0.03), 0.05, True)
+    (open_vessel,) = recovery(Status.CONVERGED).bodies
+    found = replace(recovery(Status.CONVERGED), bodies=(replace(open_vessel, cavity=cavity),))
+    assert array(publication.identify(found)).reason == [Reason.CAVITY]
     for status in (Status.CONVERGED, Status.FAILED):
         assert array(publication.identify(recovery(status))).reason == [0]
 

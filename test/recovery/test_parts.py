@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from table_scenes import VGA, Table
 
+from sq_perception.fitting.decomposition import decompose
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
@@ -61,6 +64,20 @@ def test_the_body_is_the_same_with_parts_and_without(recoverer):
     np.testing.assert_array_equal(found.superquadric.to_numbers(), without.superquadric.to_numbers())
     assert without.parts is None
     assert len(without.solids) == 1
+
+
+def test_an_object_of_a_frame_is_decomposed_like_a_cloud():
+    table = Table(distance=0.7)
+    bodies = hammer(table)
+    depth, labels = see_as_one(table, bodies, 0)
+    frame = SimpleNamespace(depth=depth, camera=VGA, labels=labels)
+    parts = decompose(frame)
+    assert union_iou(list(parts.superquadrics), bodies) > 0.6
+    assert len(parts) == 2
+    assert len(decompose(frame, most=1)) == 1
+    for wrong in (None, np.zeros_like(labels), labels + 2 * (np.arange(labels.shape[1]) < 40)):
+        with pytest.raises(ValueError, match="labels: expected the mask of one object"):
+            decompose(SimpleNamespace(depth=depth, camera=VGA, labels=wrong))
 
 
 @pytest.mark.parametrize("seed", range(3))
