@@ -19,7 +19,6 @@ Metres; depth is the z coordinate, NaN where nothing is seen.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,7 +122,7 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where((slope < 0) & (depth > 0) & (depth < 4.0), depth, np.inf)
 
 
-def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: Iterable[float]) -> np.ndarray:
+def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
     """Return the plane (4,) of a table that the camera looks down on, at a distance along its axis."""
     far, down, roll = rng.uniform(*distance), rng.uniform(*pitch), rng.uniform(-_ROLL, _ROLL)
     normal = -np.array([np.cos(down) * np.sin(roll), np.cos(down) * np.cos(roll), np.sin(down)])
