@@ -172,7 +172,8 @@ def summary(some: list[Verdict]) -> dict[str, float | None]:
     covered = [each for one in some for each in one.covered]
     cavities = [one.cavity is not None for one in some if one.depth > 0]
     false = [one.cavity is not None for one in some if one.depth == 0]
-    errors = [1e3 * abs(one.cavity.depth - one.depth) for one in some if one.cavity and one.cavity.sees_floor]
+    seen = [one for one in some if one.depth > 0 and one.cavity and one.cavity.sees_floor]
+    errors = [1e3 * abs(one.cavity.depth - one.depth) for one in seen if one.cavity]
     gain = np.array([one.parts - one.body for one in some])
     return {
         "things": len(some),

@@ -124,7 +124,7 @@ class _Search:
 
     def grown(self, most: int) -> Mixture:
         """The union of the shortest description; growing ends when two more bodies in a row do not shorten it."""
-        start = points.searched(self._cloud, None, "auto", True)
+        start = points.searched(self._cloud, None, "auto", True, points.STAGES_OF_PARTS)
         best = current = self._settled(start._replace(share=min(start.share, 0.3)), _THOROUGH)
         misses = 0
         while len(current.bodies) < most and misses < 2:

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -35,10 +35,11 @@ from sq_perception.fitting.starts import ORDERS
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.support_directions import DIRECTIONS
 
+Stages: TypeAlias = tuple[tuple[int, int, int], ...]
 MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
-_STAGES = ((200, 3, 24), (400, 8, 3))
-"""Points, rounds and most bodies of each stage of the search."""
+_STAGES, STAGES_OF_PARTS = ((200, 3, 24), (400, 8, 3)), ((400, 4, 24), (800, 8, 4))
+"""Points, rounds and most bodies of each stage of the search: for one body, and for the first one of a union."""
 _COARSE = 0.02
 """Least noise of the search, in radii of the cloud: a part that is a perfect superquadric is not the whole thing."""
 _LAST_ROUNDS = 40
@@ -178,12 +179,14 @@ def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarra
     return kept, np.where(is_known, normals, 0.0)[there]
 
 
-def searched(cloud: UnitCloud, sigma: float | None, outliers: float | str, taper: bool) -> Mixture:
+def searched(
+    cloud: UnitCloud, sigma: float | None, outliers: float | str, taper: bool, stages: Stages = _STAGES
+) -> Mixture:
     """The likeliest body of a cloud, tapered if it is likelier so than two more numbers cost."""
     share = _SHARE if outliers == "auto" else float(outliers)
     found = [Mixture(body[None], turn[None], _SIGMA, share, -math.inf) for body, turn in _starts(cloud)]
     straight, tapered = prior_of(cloud, False), prior_of(cloud, True)
-    for number, rounds, most in _STAGES:
+    for number, rounds, most in stages:
         some = cloud.surface(number)
         course = Course(False, outliers != "auto", _COARSE, rounds, 1e-3, False)
         found = [point_cost.settle(some, each, straight, course) for each in found[:most]]
