@@ -30,11 +30,12 @@ of the bodies.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
+from sq_perception.fitting.fit import Fit
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import approaches, clearance
@@ -59,9 +60,6 @@ from sq_perception.grasping.trials import (
 )
 from sq_perception.imaging.camera import Camera
 
-if TYPE_CHECKING:
-    from sq_perception.recovery.recovery import Recovery
-
 FRICTION = 0.5
 """Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
 _AT_MOST = 2.0
@@ -82,7 +80,17 @@ _LEAST = 0.05
 """Probability below which grasps are not returned."""
 
 
-def grasps_of(objects: Sequence[Recovery], gripper: Gripper, around: Surroundings, **more: Any) -> GraspPlan:
+class FittedObject(Protocol):
+    """What a plan needs of an object, as a :class:`~sq_perception.recovery.recovery.Recovery` has it."""
+
+    @property
+    def fit(self) -> Fit: ...
+
+    @property
+    def parts(self) -> Iterable[Fit] | None: ...
+
+
+def grasps_of(objects: Sequence[FittedObject], gripper: Gripper, around: Surroundings, **more: Any) -> GraspPlan:
     """Plan as :func:`grasps` for the objects of a frame that did not fail, by their parts too if they have any."""
     fits = [one.fit for one in objects] + [fit for one in objects for fit in one.parts or ()]
     owner = [k for k, one in enumerate(objects) for _ in one.parts or ()]

@@ -21,7 +21,7 @@ from sq_perception.recordings.frame_file import read
 CUBE_BODY = ["0.25", "0.15", "0.1", "0.2", "0.8", "0.5", "0.45", "0.5", "0.2", "-0.3", "0.1", "0.9"]
 CAN = ["0.05", "0.05", "0.08", "0.1", "1.0", "-5e-2", "0", "0.8", "0.7", "0.2", "0", "0.7"]
 KEYS = {"size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "seen", "status", "message"}
-KEYS |= {"label", "pixels", "track", "taper", "objectness", "parts"}
+KEYS |= {"label", "pixels", "track", "taper", "objectness", "parts", "cavity"}
 
 
 def strict(text):
