@@ -64,6 +64,10 @@ noise gives a difference D a standard deviation of 2 sqrt(D), of which the first
 """
 SLACK = 4.0
 """Difference of costs that few rays may hide: one such standard deviation."""
+SIGNIFICANT = 0.5
+"""A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
+_ALIKE, _ALONG = 0.01, 0.95
+"""Half sizes that differ by less than this share are the same, and axes with a cosine above this one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +147,7 @@ class Problem:
         states = list(starts)
         for stage in stages:
             found = self.tried(states, stage)
-            states = (within_doubt(found) if self.independent is None else by_cost(found))[: stage.kept]
+            states = (within_doubt(found) if self.independent is None else distinct(by_cost(found)))[: stage.kept]
         return states
 
     def tried(self, states: Iterable[State], stage: Stage) -> list[State]:
@@ -240,9 +244,26 @@ class Solution:
 
 def within_doubt(candidates: Iterable[State]) -> list[State]:
     """Candidates, best first, without those that are worse than the best by more than noise can make them."""
-    ranked = by_cost(candidates)
+    ranked = distinct(by_cost(candidates))
     least = ranked[0].cost
     return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
+
+
+def distinct(states: Iterable[State]) -> list[State]:
+    """The first of all that are one body in other forms, in their order."""
+    found: list[State] = []
+    for state in states:
+        if not any(alike(state, other) and abs(state.rotation[:, 2] @ other.rotation[:, 2]) > _ALONG for other in found):
+            found.append(state)
+    return found
+
+
+def alike(state: State, other: State) -> bool:
+    """Whether two searches ended in the same valley: at about the same cost and sizes, in any order of the axes."""
+    if abs(state.cost - other.cost) > SIGNIFICANT:
+        return False
+    pairs = zip(sorted(state.parameters[:3].tolist()), sorted(other.parameters[:3].tolist()), strict=True)
+    return all(abs(one - another) < _ALIKE * one for one, another in pairs)
 
 
 def by_cost(states: Iterable[State]) -> list[State]:

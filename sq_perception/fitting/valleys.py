@@ -29,16 +29,12 @@ import numpy as np
 from sq_perception.fitting import starts
 from sq_perception.fitting.covariance import Alternative, undetermined
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.multistart import SETTLE, SLACK, Problem, Solution, by_cost
+from sq_perception.fitting.multistart import SETTLE, SIGNIFICANT, SLACK, Problem, Solution, alike, by_cost
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.rays import DEPTH, Rays
 from sq_perception.fitting.starts import resized
 from sq_perception.geometry.kernels import kernel
 
-SIGNIFICANT = 0.5
-"""A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
-_ALIKE = 0.01
-"""Half sizes that differ by less than this share are the same."""
 _SETTLED, _UNSURE = 1.03, 0.01
 """Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
 valleys of the cost are tried; chosen on benchmarks/single_body."""
@@ -75,14 +71,6 @@ _THIN = 0.3
 """Half size, as a share of the other two, at which one that the image leaves open is also tried."""
 _EXPECTATION_SIGMA = 0.25
 """Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
-
-
-def alike(state: State, other: State) -> bool:
-    """Whether two searches ended in the same valley: at about the same cost and sizes, in any of a body's forms."""
-    if abs(state.cost - other.cost) > SIGNIFICANT:
-        return False
-    sizes = np.abs(np.sort(state.parameters[:3]) - np.sort(other.parameters[:3]))
-    return bool((sizes < _ALIKE * np.sort(state.parameters[:3])).all())
 
 
 def explored(solution: Solution) -> Solution:
