@@ -204,7 +204,7 @@ def thing(problem: Problem, starts: Sequence[State]) -> Solution:
     solution = replace(solution, problem=problem, rays=rays.weighing(1 / max(1.0, left / EXPLAINED)))
     # As far off as noise reaches at most: points of a bowl or a pair of pliers typically are.
     if left > _HUBER * (2 * INLIER - _HUBER):
-        solution = replace(solution, notes=_AS_HULL, as_hull=True)
+        solution = solution.noted(notes=_AS_HULL, as_hull=True)
     return solution
 
 

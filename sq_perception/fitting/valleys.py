@@ -103,7 +103,7 @@ def explored(solution: Solution) -> Solution:
         return solution
     weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
     more = (Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))
-    return replace(solution, alternatives=(*solution.alternatives, *more))
+    return solution.noted(alternatives=(*solution.alternatives, *more))
 
 
 def _refined(solution: Solution, rivals: list[State]) -> list[State]:
@@ -136,7 +136,7 @@ def along_view(solution: Solution) -> Solution:
         best, allowed = plausible(solution)
         solution = replace(solution, state=best)
         if allowed:
-            solution = replace(solution, alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
+            solution = solution.noted(alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
     return solution
 
 
@@ -175,7 +175,7 @@ def or_oval(solution: Solution) -> Solution:
     oval = replace(solution, problem=free, state=free.refine(solution.state, rays))
     dearer = problem.settle(oval.state, rays, 0).cost - problem.settle(solution.state, rays, 0).cost
     share = _OVAL / (_OVAL + (1 - _OVAL) * math.exp(0.5 * max(dearer, 0.0)))
-    return replace(solution, alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
+    return solution.noted(alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
 
 
 def _contradicts(solution: Solution) -> bool:
@@ -306,7 +306,7 @@ def with_open_ends(solution: Solution) -> Solution:
         if problem.late:
             break
     others = tuple(Alternative(other, 1 / (1 + len(found))) for other in found)
-    return replace(solution, alternatives=(*solution.alternatives, *others))
+    return solution.noted(alternatives=(*solution.alternatives, *others))
 
 
 def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:
