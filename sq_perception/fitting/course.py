@@ -187,7 +187,7 @@ def _without_outliers(observation: Observation, hits: np.ndarray, state: State) 
 
 def thing(problem: Problem, starts: Sequence[State]) -> Solution:
     """The most probable body of a thing, its misfit estimated with it."""
-    settled = problem.straight().search(starts, THING)
+    settled = problem.search(problem.straight().search(starts, THING[:1]), THING[1:])
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     drawn = problem
     if misfit > 1.0 and problem.hull is not None:
@@ -204,7 +204,7 @@ def thing(problem: Problem, starts: Sequence[State]) -> Solution:
     solution = replace(solution, problem=problem, rays=rays.weighing(1 / max(1.0, left / EXPLAINED)))
     # As far off as noise reaches at most: points of a bowl or a pair of pliers typically are.
     if left > _HUBER * (2 * INLIER - _HUBER):
-        solution = replace(solution, notes=_AS_HULL, as_hull=True)
+        solution = solution.noted(notes=_AS_HULL, as_hull=True)
     return solution
 
 

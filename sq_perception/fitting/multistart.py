@@ -62,8 +62,12 @@ DOUBT, RIVAL = 25.0, 1.3
 """Excess of a cost over the best, and factor of it, up to either of which bodies go on together: on the same rays,
 noise gives a difference D a standard deviation of 2 sqrt(D), of which the first is 2.5; few steps have not converged.
 """
-SLACK = 4.0
+SLACK = 1.0
 """Difference of costs that few rays may hide: one such standard deviation."""
+SIGNIFICANT = 0.5
+"""A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
+_ALIKE, _ALONG = 0.01, 0.95
+"""Half sizes that differ by less than this share are the same, and axes with a cosine above this one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +147,7 @@ class Problem:
         states = list(starts)
         for stage in stages:
             found = self.tried(states, stage)
-            states = (within_doubt(found) if self.independent is None else by_cost(found))[: stage.kept]
+            states = (within_doubt(found) if self.independent is None else distinct(by_cost(found)))[: stage.kept]
         return states
 
     def tried(self, states: Iterable[State], stage: Stage) -> list[State]:
@@ -172,6 +176,10 @@ class Problem:
 
     def _minimized(self, residual: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
         return minimize(residual, *rays, self.terms_at(state), state, self.limits, steps, tolerance)
+
+
+_OF_A_VALLEY = ("distances", "_with_taper")
+"""What a solution computes once of its problem, body and rays."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,21 +224,27 @@ class Solution:
         rays = self.problem.observation.object_rays(SAMPLE)
         return surface_distance(rays, self.state.parameters, self.state.rotation)
 
-    @cached_property
+    @property
     def covariance(self) -> np.ndarray:
         """Covariance (11, 11) from the valley of the cost around the body and its distance to a predicted hull."""
-        return np.ascontiguousarray(self._with_taper[:UNTAPERED, :UNTAPERED])
+        return self._with_taper[:UNTAPERED, :UNTAPERED] * self.spread_factor
 
     @property
     def taper_covariance(self) -> np.ndarray:
         """Covariance (2, 2) of the tapers; 0 where the body may not taper."""
-        found = self._with_taper[UNTAPERED:, UNTAPERED:]
-        return np.ascontiguousarray(found) if len(found) else np.zeros((2, 2))
+        found = self._with_taper[UNTAPERED:, UNTAPERED:] * self.spread_factor
+        return found if len(found) else np.zeros((2, 2))
 
     @cached_property
     def _with_taper(self) -> np.ndarray:
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
-        return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
+        return covariance_at(self.state, self.rays, terms, outline, self.problem.hull)
+
+    def noted(self, **changed: Any) -> Solution:
+        """The solution with other fields than its problem, body and rays changed: its valley is the same."""
+        other = replace(self, **changed)
+        other.__dict__.update({name: self.__dict__[name] for name in _OF_A_VALLEY if name in self.__dict__})
+        return other
 
     def unsure(self) -> np.ndarray:
         """Standard deviations (3,) of the half sizes, as shares of them."""
@@ -240,9 +254,27 @@ class Solution:
 
 def within_doubt(candidates: Iterable[State]) -> list[State]:
     """Candidates, best first, without those that are worse than the best by more than noise can make them."""
-    ranked = by_cost(candidates)
+    ranked = distinct(by_cost(candidates))
     least = ranked[0].cost
     return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
+
+
+def distinct(states: Iterable[State]) -> list[State]:
+    """The first of all that are one body in other forms, in their order."""
+    found: list[State] = []
+    for state in states:
+        z = state.rotation[:, 2]
+        if not any(alike(state, other) and abs(z @ other.rotation[:, 2]) > _ALONG for other in found):
+            found.append(state)
+    return found
+
+
+def alike(state: State, other: State) -> bool:
+    """Whether two searches ended in the same valley: at about the same cost and sizes, in any order of the axes."""
+    if abs(state.cost - other.cost) > SIGNIFICANT:
+        return False
+    pairs = zip(sorted(state.parameters[:3].tolist()), sorted(other.parameters[:3].tolist()), strict=True)
+    return all(abs(one - another) < _ALIKE * one for one, another in pairs)
 
 
 def by_cost(states: Iterable[State]) -> list[State]:

@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Literal
 
@@ -194,13 +194,13 @@ def _solved(task: _Task) -> Solution | None:
         if exactly is None or exactly.misfit >= _NOISE_ALONE or exactly.unsure().max() > WEAK_SHARE:
             return thing
         more = (*exactly.alternatives, Alternative(thing.state, _AS_A_THING))
-        return replace(exactly, alternatives=more, spread_factor=course.SPREAD)
+        return exactly.noted(alternatives=more, spread_factor=course.SPREAD)
     exactly = _exactly(task, [])
     if exactly is None or exactly.problem.late:
         return exactly
     may_stray = task.camera.is_pinhole and not task.is_fine and not task.fills_image
     if exactly.misfit < (_NOISE_ALONE if may_stray else course.EXPLAINS):
-        return replace(exactly, spread_factor=course.SPREAD) if may_stray else exactly
+        return exactly.noted(spread_factor=course.SPREAD) if may_stray else exactly
     left = deviation(np.abs(exactly.distances))
     return _as_thing(task, task.model_error if may_stray else left, [exactly.state, *task.starts()])
 
@@ -239,9 +239,7 @@ def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution 
         if solution.problem.late or solution.misfit > course.EXPLAINS:
             break
         solution = step(solution)
-    if solution.problem.late and solution.misfit > _UNFINISHED:
-        return replace(solution, is_unfinished=True)
-    return solution
+    return solution.noted(is_unfinished=solution.problem.late and solution.misfit > _UNFINISHED)
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:

@@ -29,16 +29,12 @@ import numpy as np
 from sq_perception.fitting import starts
 from sq_perception.fitting.covariance import Alternative, undetermined
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.multistart import SETTLE, SLACK, Problem, Solution, by_cost
+from sq_perception.fitting.multistart import SETTLE, SIGNIFICANT, SLACK, Problem, Solution, alike, by_cost
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.rays import DEPTH, Rays
 from sq_perception.fitting.starts import resized
 from sq_perception.geometry.kernels import kernel
 
-SIGNIFICANT = 0.5
-"""A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
-_ALIKE = 0.01
-"""Half sizes that differ by less than this share are the same."""
 _SETTLED, _UNSURE = 1.03, 0.01
 """Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
 valleys of the cost are tried; chosen on benchmarks/single_body."""
@@ -77,14 +73,6 @@ _EXPECTATION_SIGMA = 0.25
 """Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
 
 
-def alike(state: State, other: State) -> bool:
-    """Whether two searches ended in the same valley: at about the same cost and sizes, in any of a body's forms."""
-    if abs(state.cost - other.cost) > SIGNIFICANT:
-        return False
-    sizes = np.abs(np.sort(state.parameters[:3]) - np.sort(other.parameters[:3]))
-    return bool((sizes < _ALIKE * np.sort(state.parameters[:3])).all())
-
-
 def explored(solution: Solution) -> Solution:
     """The solution of an exact superquadric after a search of other valleys, of which noise and a poor view may hide a
     deeper one.
@@ -115,7 +103,7 @@ def explored(solution: Solution) -> Solution:
         return solution
     weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
     more = (Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))
-    return replace(solution, alternatives=(*solution.alternatives, *more))
+    return solution.noted(alternatives=(*solution.alternatives, *more))
 
 
 def _refined(solution: Solution, rivals: list[State]) -> list[State]:
@@ -148,7 +136,7 @@ def along_view(solution: Solution) -> Solution:
         best, allowed = plausible(solution)
         solution = replace(solution, state=best)
         if allowed:
-            solution = replace(solution, alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
+            solution = solution.noted(alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
     return solution
 
 
@@ -187,7 +175,7 @@ def or_oval(solution: Solution) -> Solution:
     oval = replace(solution, problem=free, state=free.refine(solution.state, rays))
     dearer = problem.settle(oval.state, rays, 0).cost - problem.settle(solution.state, rays, 0).cost
     share = _OVAL / (_OVAL + (1 - _OVAL) * math.exp(0.5 * max(dearer, 0.0)))
-    return replace(solution, alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
+    return solution.noted(alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
 
 
 def _contradicts(solution: Solution) -> bool:
@@ -318,7 +306,7 @@ def with_open_ends(solution: Solution) -> Solution:
         if problem.late:
             break
     others = tuple(Alternative(other, 1 / (1 + len(found))) for other in found)
-    return replace(solution, alternatives=(*solution.alternatives, *others))
+    return solution.noted(alternatives=(*solution.alternatives, *others))
 
 
 def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:

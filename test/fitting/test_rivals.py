@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.multistart import alike
 from sq_perception.fitting.starts import other_axes, other_depths, other_orders, resized
-from sq_perception.fitting.valleys import alike
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
