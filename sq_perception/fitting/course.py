@@ -187,7 +187,7 @@ def _without_outliers(observation: Observation, hits: np.ndarray, state: State) 
 
 def thing(problem: Problem, starts: Sequence[State]) -> Solution:
     """The most probable body of a thing, its misfit estimated with it."""
-    settled = problem.search(problem.straight().search(starts, THING[:1]), THING[1:])
+    settled = problem.straight().search(starts, THING)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     drawn = problem
     if misfit > 1.0 and problem.hull is not None:
