@@ -13,7 +13,6 @@ from sq_perception.files.version import __version__
 
 if TYPE_CHECKING:
     from sq_perception.evaluation.recovery_figure import recovery_figure
-    from sq_perception.fitting.decomposition import decompose
     from sq_perception.fitting.fit import Fit, Parts, Status
     from sq_perception.fitting.options import FitOptions
     from sq_perception.fitting.points import fit_mesh, fit_points
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.frame_file import read as read_frame
     from sq_perception.recovery.crops import recover_crops
+    from sq_perception.recovery.decomposition import decompose
     from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
 __all__ = [
@@ -68,7 +68,7 @@ _HOMES = {
     "RecoveryOptions": "recovery.recoverer",
     "Status": "fitting.fit",
     "Superquadric": "geometry.superquadric",
-    "decompose": "fitting.decomposition",
+    "decompose": "recovery.decomposition",
     "fit": "fitting.surface_fit",
     "fit_mesh": "fitting.points",
     "fit_points": "fitting.points",

@@ -21,7 +21,6 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -55,16 +54,15 @@ def decompose(
 
     Parameters
     ----------
-    thing : (n, 3), a mesh or a frame
+    thing : (n, 3) or a mesh
         Points of its surface, metres or any unit, in any frame; or what has ``vertices`` (n, 3) and ``faces`` (m, 3),
-        as a ``trimesh.Trimesh``; or what has ``depth``, ``camera`` and ``labels``, the mask of one object, as
-        ``sq.read_frame`` gives it: then parts are those of :mod:`sq_perception.recovery.parts`.
+        as a ``trimesh.Trimesh``.
     normals : (n, 3), optional
         Outward normals of points.
     most
-        1 or more; a frame's object of more parts is one body.
+        1 or more.
     sigma
-        Standard deviation of the noise, in the unit of the points; None estimates it, as always for a frame.
+        Standard deviation of the noise, in the unit of the points; None estimates it.
 
     Raises
     ------
@@ -74,8 +72,6 @@ def decompose(
     began = time.perf_counter()
     if most < 1:
         raise ValueError(f"most: expected 1 or more parts, got {most}")
-    if hasattr(thing, "depth") and hasattr(thing, "camera"):
-        return _parts_of_view(thing, most)
     given, normals = points.surface_of(thing, normals)
     cloud = UnitCloud.of(given, normals, points.MOST_POINTS)
     reason = points.why_unfit(cloud)
@@ -91,28 +87,6 @@ def decompose_all(things: Sequence[Any], *, most: int = MOST_PARTS, jobs: int | 
     """:func:`decompose` of many objects, ``jobs`` at a time (as many as there are cores if not given)."""
     with ThreadPoolExecutor(jobs) as executor:  # kernels let other threads of Python compute
         return list(executor.map(lambda thing: decompose(thing, most=most), things))
-
-
-def _parts_of_view(frame: Any, most: int) -> Parts:
-    """The parts of the one object of a frame, or its body as the only one."""
-    from sq_perception.recovery.recoverer import RecoveryOptions  # here: points need neither networks nor masks
-
-    if frame.labels is None:
-        raise ValueError("labels: expected the mask of one object, got none")
-    found = _recoverer().recover(frame.depth, frame.camera, frame.labels, RecoveryOptions(parts=True)).bodies
-    if len(found) != 1:
-        raise ValueError(f"labels: expected the mask of one object that was measured, got {len(found)} objects")
-    fit, parts = found[0].fit, found[0].parts
-    if parts is not None and len(parts) <= most:
-        return parts
-    return Parts.of([fit], np.array([fit.inlier_share]), fit.noise, fit.milliseconds)
-
-
-@lru_cache(maxsize=1)
-def _recoverer() -> Any:
-    from sq_perception.recovery.recoverer import Recoverer  # here: as above
-
-    return Recoverer()
 
 
 class _Search:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from table_scenes import VGA, Table
 
-from sq_perception.fitting.decomposition import decompose
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.decomposition import decompose
 from sq_perception.recovery.parts import Evidence
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions, render_recovery
 
