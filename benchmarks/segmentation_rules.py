@@ -2,6 +2,7 @@
 
     python benchmarks/segmentation_rules.py [--scenes 135] [--first 0] [--kinds flat heap ...] [--rules ...]
                                             [--each FILE] [--name segmentation_rules]
+    python benchmarks/segmentation_rules.py --unlabelled FOLDER --name segmentation_unlabelled
 
 Scenes are those of :mod:`common.segmentation_scenes`, ``--scenes`` of each kind; each is drawn once and segmented
 once a rule, by the geometry and the network of masks as ``Recoverer.recover`` does.  Recorded frames with human masks
@@ -18,6 +19,9 @@ in 100 scenes; with the standard error of the sum of the scenes' differences.  A
 errors has no place in the package.  results/segmentation_rules_before.md has those that were there before.  ``--each``
 names a file of JSON lines, one a scene, that a run adds to: a run that was stopped goes on, and one of more scenes or
 other seeds counts them together.
+
+``--unlabelled`` takes recorded frames (NPZ with depth and K) without masks: how many of them a rule changes, and the
+segments with it, and without it, that no other one overlaps by an IoU of 0.8.
 """
 
 from __future__ import annotations
@@ -42,13 +46,14 @@ from segmentation import frames
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import inference
+from sq_perception.recordings.frame_file import read as read_frame
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.segmentation import segments
 from sq_perception.segmentation.options import SegmentationOptions
 
 MOST = 128
 _FEWEST, _VGA = 200, 640 * 480
-_MATCH = 0.5
+_MATCH, _ALIKE = 0.5, 0.8
 FIGURES = ("found", "nothing", "pieces", "iou")
 
 
@@ -160,6 +165,40 @@ def scenes(
             yield "recorded", number, each.frame.depth, each.truth, each.frame.camera
 
 
+def unlabelled(folder: Path, rules: list[str]) -> tuple[dict[str, Any], str]:
+    """What each rule changes in frames without masks."""
+    changes: dict[str, list[tuple[int, int]]] = {rule: [] for rule in rules}
+    count = 0
+    for path in sorted(folder.glob("*.npz")):
+        frame = read_frame(path)
+        answers: dict[bytes, np.ndarray] = {}
+        base = segmented(frame.depth, frame.camera, "", answers)
+        count += len(np.unique(base[base > 0]))
+        for rule in rules:
+            with without(rule):
+                other = segmented(frame.depth, frame.camera, rule, answers)
+            changes[rule].append((unlike(base, other), unlike(other, base)))
+    found = {}
+    for rule, each in changes.items():
+        gone, new = np.sum(each, axis=0)
+        found[rule] = {"frames": sum(map(any, each)), "only with": int(gone), "only without": int(new)}
+    rows = [[rule, *one.values()] for rule, one in found.items()]
+    frames_ = len(next(iter(changes.values())))
+    table = report.table(["rule", "frames that differ", "segments only with it", "segments only without it"], rows)
+    return {"frames": frames_, "segments": count, "rules": found}, f"{frames_} frames, {count} segments\n\n{table}"
+
+
+def unlike(labels: np.ndarray, others: np.ndarray) -> int:
+    """How many segments overlap none of the others by an IoU of at least 0.8."""
+    count = 0
+    for label in np.unique(labels[labels > 0]):
+        inside = labels == label
+        names, shared = np.unique(others[inside], return_counts=True)
+        best = [n / (inside.sum() + (others == k).sum() - n) for k, n in zip(names, shared, strict=True) if k > 0]
+        count += max(best, default=0.0) < _ALIKE
+    return count
+
+
 def gains(rows: list[dict[str, Verdict]], rule: str) -> dict[str, dict[str, float]]:
     """What a rule gains, and the standard error of that, by figure."""
     things = max(sum(row["all"].things for row in rows), 1)
@@ -227,9 +266,14 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene of a kind")
     parser.add_argument("--kinds", nargs="+", default=kinds, choices=kinds)
     parser.add_argument("--rules", nargs="*", default=list(RULES), choices=list(RULES))
+    parser.add_argument("--unlabelled", type=Path, metavar="FOLDER", help="of recorded frames without masks, instead")
     parser.add_argument("--each", type=Path, help="JSON lines, one a scene, that are added to")
     options = parser.parse_args()
     cv2.setNumThreads(1)
+    if options.unlabelled:
+        result, table = unlabelled(options.unlabelled, options.rules)
+        report.write(options.name, result, table)
+        return
     lines = options.each.read_text().splitlines() if options.each and options.each.exists() else []
     by_kind: dict[str, list[dict[str, Verdict]]] = {}
     known = set()
