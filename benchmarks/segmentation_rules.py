@@ -182,7 +182,7 @@ def unlabelled(folder: Path, rules: list[str]) -> tuple[dict[str, Any], str]:
     for rule, each in changes.items():
         gone, new = np.sum(each, axis=0)
         found[rule] = {"frames": sum(map(any, each)), "only with": int(gone), "only without": int(new)}
-    rows = [[rule, *one.values()] for rule, one in found.items()]
+    rows = [[rule, *map(str, one.values())] for rule, one in found.items()]
     frames_ = len(next(iter(changes.values())))
     table = report.table(["rule", "frames that differ", "segments only with it", "segments only without it"], rows)
     return {"frames": frames_, "segments": count, "rules": found}, f"{frames_} frames, {count} segments\n\n{table}"
