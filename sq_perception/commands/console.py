@@ -132,9 +132,11 @@ def target(text: str) -> Path:
 
 def text_target(text: str) -> str:
     """Check an output file name, or - for standard output; an argument type."""
-    if text == STANDARD_OUTPUT and sys.stdout is None:
+    if text not in (STANDARD_OUTPUT, "/dev/stdout"):
+        return str(target(text))
+    if sys.stdout is None:
         raise argparse.ArgumentTypeError("the standard output is closed")
-    return text if text == STANDARD_OUTPUT else str(target(text))
+    return STANDARD_OUTPUT
 
 
 def folder(text: str) -> Path:

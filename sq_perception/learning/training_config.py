@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from sq_perception.files import plain_yaml
+from sq_perception.files.unpacking import UnpackingError, read_yaml
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Framing
 
 if TYPE_CHECKING:
@@ -237,8 +237,8 @@ def _values(path: str | Path) -> dict[str, Any]:
     if not source.is_file():
         raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped_names())}")
     try:
-        values = plain_yaml.read(source) or {}
-    except plain_yaml.YamlError as error:
+        values = read_yaml(source) or {}
+    except UnpackingError as error:
         raise ValueError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected 'name: value' lines")

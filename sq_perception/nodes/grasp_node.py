@@ -31,7 +31,7 @@ from visualization_msgs.msg import MarkerArray
 from sq_msgs_py import answers, transforms
 from sq_msgs_py import grasps as messages
 from sq_msgs_py.interfaces import grasp_array
-from sq_msgs_py.markers import Mesh, markers
+from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
@@ -44,7 +44,7 @@ from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
-from sq_perception.nodes.outputs import ARRIVAL, MarkerIds
+from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
@@ -66,7 +66,6 @@ class GraspNode(ManagedNode):
         self._arrival = 0.0
         """Its arrival, seconds of the node's clock."""
         self._plane: PoseStamped | None = None
-        self._marker_ids = MarkerIds()
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
         self._array: Publisher | None = None
@@ -107,7 +106,7 @@ class GraspNode(ManagedNode):
         with self._publishing:
             if self._outputs and self._last is not None and self.context.ok():
                 shown = self._outputs[-1]
-                shown.publish(self._markers([], [], self._last.header))
+                shown.publish(markers([], [], self._last.header, namespace="grasps"))
                 shown.wait_for_all_acked(ARRIVAL)
             for publisher in (*self._outputs, *([] if self._array is None else [self._array])):
                 self.destroy_publisher(publisher)
@@ -242,12 +241,8 @@ class GraspNode(ManagedNode):
         for grasp in best.values():
             vertices, faces, edges = hand.mesh(grasp.opening)
             meshes.append((grasp.to_body_frame(vertices), faces, grasp.to_body_frame(edges)))
-        shown.publish(self._markers(meshes, list(best), header))
+        shown.publish(markers(meshes, list(best), header, namespace="grasps"))
         return found
-
-    def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
-        """Return markers of grasps with their bodies' ids, which replace the earlier ones."""
-        return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replace_markers(ids))
 
 
 def plan(array: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:

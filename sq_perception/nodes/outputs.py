@@ -14,9 +14,8 @@ of added objects survives a restart after a fault, so that vanished objects are 
 
 from __future__ import annotations
 
-import math
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from functools import partial
 from time import monotonic
 from typing import Any
@@ -54,31 +53,6 @@ ARRIVAL = Duration(seconds=0.5)
 _ALL_AGAIN = 5.0
 """Seconds between two messages of the whole planning scene: a planner receives none while it plans, its queue holds
 ten, and a lost message would leave its world wrong for good."""
-_REPEATED = 10.0
-"""Seconds for which the deletion of a marker is repeated: longer than RViz is ever busy."""
-_MOST_AGAIN = 32
-"""Number of ids whose deletion is repeated, the last ones: each costs 0.1 ms per message."""
-
-
-class MarkerIds:
-    """Ids of markers that a listener may still show: those of the last message, and for a while earlier ones.
-
-    A listener that is busy loses messages, and a marker whose deletion was in a lost one would stay for good.
-    """
-
-    def __init__(self) -> None:
-        self._until: dict[int, float] = {}
-        """Time until which each deletion is repeated, in order of deletion; endless while the marker is shown."""
-
-    def replace_markers(self, ids: Sequence[int]) -> list[int]:
-        """Return the ids whose markers the next message, which shows ``ids``, must delete."""
-        now, shown = monotonic(), dict.fromkeys(ids, math.inf)
-        gone = {number: until for number, until in self._until.items() if until >= now and number not in shown}
-        again = dict([one for one in gone.items() if one[1] < math.inf][-_MOST_AGAIN:])
-        fresh = dict.fromkeys((number for number in gone if gone[number] == math.inf), now + _REPEATED)
-        self._until = again | fresh | shown
-        return [*again, *fresh]
-
 
 class Outputs:
     """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
@@ -87,7 +61,6 @@ class Outputs:
         self._node, self._poses = node, poses
         self.optional = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
-        self._marker_ids = MarkerIds()
         self._header: Any = None
         """Header of the markers that are shown, if there are any."""
 
@@ -119,7 +92,7 @@ class Outputs:
         """Delete the markers, since nothing updates them from now on."""
         if self._header is not None and self._node.context.ok():
             header, self._header = self._header, None
-            self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replace_markers(())))
+            self.markers.publish(markers([], [], header))
 
     def shown_bodies(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """Return the findings as every output shows them: in ``target_frame`` if there is one.
@@ -152,8 +125,7 @@ class Outputs:
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
-                    gone = self._marker_ids.replace_markers(shown.shown_ids)
-                    self.markers.publish(shown.markers(gone, parameters.marker_alpha))
+                    self.markers.publish(shown.markers(parameters.marker_alpha))
                     self._header = shown.header
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sq_perception.files import plain_yaml
+from sq_perception.files.unpacking import UnpackingError, read_yaml
 from sq_perception.imaging import compressed_depth
 from sq_perception.recordings import publication
 from sq_perception.recordings.frame_file import FrameError, Stamp
@@ -192,8 +192,8 @@ def _open(path: Path) -> tuple[Any, Any]:
 def _refuse_packed_files(folder: Path) -> None:
     """rosbags would unpack a bag that was packed as a whole into a temporary folder, whatever its size."""
     try:
-        document = plain_yaml.read(folder / "metadata.yaml")
-    except plain_yaml.YamlError as error:
+        document = read_yaml(folder / "metadata.yaml")
+    except UnpackingError as error:
         raise FrameError(f"{folder}: metadata.yaml: {describe(error)}") from error
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
     if not isinstance(information, dict):

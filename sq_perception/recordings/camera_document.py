@@ -13,11 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from sq_perception.files import plain_yaml
-from sq_perception.files.unpacking import npy_array, npz_arrays
+from sq_perception.files.unpacking import LONGEST_TEXT, UnpackingError, npy_array, npz_arrays, yaml_documents
 
-LARGEST = plain_yaml.LARGEST
-"""Bytes of a file."""
 _SHAPES = {4: (4,), 9: (3, 3), 12: (3, 4), 16: (4, 4)}
 _COLMAP = re.compile(r"\s*(\d+)\s+([A-Z]\w+)\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
 _COLMAP_PARAMETERS = {
@@ -47,11 +44,11 @@ def read(path: Path) -> Any:
         return _matrix(npy_array(path))
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+            data = file.read(LONGEST_TEXT + 1)
     except OSError as error:
         raise ValueError(str(error)) from error
-    if len(data) > LARGEST:
-        raise ValueError(f"expected at most {LARGEST} bytes")
+    if len(data) > LONGEST_TEXT:
+        raise ValueError(f"expected at most {LONGEST_TEXT} bytes")
     text = data.decode("utf-8", errors="replace")
     for form in (_of_numbers, _of_colmap):
         if (found := form(text)) is not None:
@@ -65,8 +62,8 @@ def read(path: Path) -> Any:
     # OpenCV's own directive and tags are no YAML that others know.
     plain = re.sub(r"^%YAML.*|!!opencv-\S+", "", text, flags=re.MULTILINE)
     try:
-        found = next((entry for entry in plain_yaml.documents(plain.encode()) if entry is not None), None)
-    except plain_yaml.YamlError:
+        found = next((entry for entry in yaml_documents(plain.encode()) if entry is not None), None)
+    except UnpackingError:
         if lines := _of_lines(text):
             return lines
         raise

@@ -9,7 +9,7 @@ Metres in the optical frame; for frames of the unit cube (``is_cube``) the cube 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -180,23 +180,14 @@ class Findings:
             parts=poses.moved(self.parts, rotation, translation),
         )
 
-    def markers(
-        self,
-        previous_ids: Iterable[int] = (),
-        alpha: float = ALPHA,
-        types: MessageTypes = installed,
-    ) -> Any:
-        """A MarkerArray of the bodies that did not fail, or their parts; those of ``previous_ids`` that are gone are
-        deleted.
-
-        Colours are by id; ``alpha`` is their opacity.
-        """
+    def markers(self, alpha: float = ALPHA, types: MessageTypes = installed) -> Any:
+        """Return a MarkerArray of the bodies that did not fail, or their parts, with colours of this opacity by id."""
         shown, surfaces = self.array.recovered, []
         for k, mesh in enumerate(self.meshes):
             parts = self.parts.parts_of(shown.id[k])
             meshes = [triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(parts)] or [mesh]
             surfaces.append(_join(meshes, parts if len(parts) else shown.where(np.arange(len(shown)) == k)))
-        return markers(surfaces, self.shown_ids, self.header, alpha=alpha, previous_ids=previous_ids, types=types)
+        return markers(surfaces, self.shown_ids, self.header, alpha=alpha, types=types)
 
 
 def findings(found: Identified, header: Any, is_cube: bool) -> Findings:

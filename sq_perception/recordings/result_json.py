@@ -188,19 +188,9 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
 
 
 class ResultLines:
-    """A file of JSON lines that grows frame by frame; close it when all is done.
+    """A file of JSON lines that grows frame by frame; close it when all is done.  A stream is written to as it is.
 
-    Parameters
-    ----------
-    path
-        The file.  A device or FIFO is written to as it is.
-    options
-        The options that decide what is found.
-
-    Attributes
-    ----------
-    done : list of dict
-        Elements of ``frames`` that were there at the beginning.
+    ``options`` are those that decide what is found; ``done`` has the elements of ``frames`` that were there before.
 
     Raises
     ------
@@ -213,82 +203,62 @@ class ResultLines:
     def __init__(self, path: str | Path, options: Mapping[str, Any]) -> None:
         self._path = Path(path)
         self.done: list[dict[str, Any]] = []
-        beginning = _line(head(options))
-        self._can_go_back = not output_file.is_stream(self._path)
-        self._descriptor = (output_file.open_locked if self._can_go_back else output_file.open_stream)(self._path)
+        is_stream = output_file.is_stream(self._path)
+        self._file = self._path.open("ab") if is_stream else os.fdopen(output_file.open_locked(self._path), "r+b")
         try:
-            self._end = self._found(json.loads(beginning)) if self._can_go_back else 0
-            if not self._end:
-                self._put(beginning)
+            beginning = head(options)
+            if is_stream or not self._resume(beginning):
+                self.add(beginning)
         except BaseException:
             self.close()
             raise
 
     def add(self, entry: Mapping[str, Any]) -> None:
-        """Write the element of a frame; a line that cannot be written whole is taken back."""
-        self._put(_line(entry))
+        """Write the element of a frame."""
+        with output_file.name_in_errors(self._path):
+            self._file.write(_line(entry))
+            self._file.flush()
 
     def close(self) -> None:
         """End; more than once does no harm."""
-        if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
+        with suppress(OSError):  # what a full disk did not take
+            self._file.close()
 
-    def _put(self, data: bytes) -> None:
-        rest = memoryview(data)
-        try:
-            with output_file.name_in_errors(self._path):
-                while rest:
-                    rest = rest[os.write(self._descriptor, rest) :]
-        except BaseException:
-            if self._can_go_back:
-                with suppress(OSError):
-                    self._go_to(self._end)
-            raise
-        self._end += len(data)
-
-    def _found(self, expected: Mapping[str, Any]) -> int:
-        """Read what is there; leaves the file at the end of its last whole line, which it returns."""
-        size = os.fstat(self._descriptor).st_size
+    def _resume(self, expected: Mapping[str, Any]) -> bool:
+        """Read what is there and go to the end of its last whole line; return whether that is not the beginning."""
+        size = os.fstat(self._file.fileno()).st_size
         if size > LARGEST:
             raise OSError(errno.EFBIG, f"expected at most {LARGEST} bytes to go on with", str(self._path))
-        with open(self._descriptor, "rb", closefd=False) as file:
-            data = file.read()
+        data = self._file.read()
         lines = data.split(b"\n")[:-1]
-        entries = [self._entry(k + 1, line) for k, line in enumerate(lines)]
+        entries = [self._entry(k, line) for k, line in enumerate(lines, 1)]
         if len(entries) == 1 and _is_head(entries[0], expected):
             lines = []  # of a run that came to no frame: it is begun again, with any options
         elif entries:
             self._compare(entries[0], expected)
         elif data.strip() and not _line(expected).startswith(data):
             raise ResumeError(f"{self._path}: expected a file of JSON lines that this command wrote")
-        for k, entry in enumerate(entries[1:]):
+        for k, entry in enumerate(entries[1:], 2):
             if not isinstance(entry.get("file"), str) or not isinstance(entry.get("superquadrics"), list):
-                raise ResumeError(f"{self._path}: line {k + 2}: expected what was recovered from a frame")
+                raise ResumeError(f"{self._path}: line {k}: expected what was recovered from a frame")
         self.done = entries[1:]
-        end = sum(len(line) + 1 for line in lines)
-        self._go_to(end)
-        return end
-
-    def _go_to(self, end: int) -> None:
-        os.ftruncate(self._descriptor, end)
-        os.lseek(self._descriptor, end, os.SEEK_SET)
+        self._file.seek(sum(len(line) + 1 for line in lines))
+        self._file.truncate()
+        return bool(lines)
 
     def _entry(self, number: int, line: bytes) -> dict[str, Any]:
         try:
             entry = json.loads(line, parse_constant=_refuse)
+            if not isinstance(entry, dict):
+                raise ValueError("a JSON object")
+            return entry
         except (ValueError, RecursionError) as error:
             raise ResumeError(f"{self._path}: line {number}: expected JSON: {error}") from error
-        if not isinstance(entry, dict):
-            raise ResumeError(f"{self._path}: line {number}: expected a JSON object")
-        return entry
 
     def _compare(self, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-        if (found.get("format"), found.get("version")) != (expected["format"], expected["version"]):
-            raise ResumeError(f"{self._path}: expected a file of JSON lines that this command wrote")
         theirs, ours = found.get("options"), expected["options"]
-        if not isinstance(theirs, dict):
-            raise ResumeError(f"{self._path}: expected 'options' in its first line")
+        if (found.get("format"), found.get("version")) != (FORMAT, VERSION) or not isinstance(theirs, dict):
+            raise ResumeError(f"{self._path}: expected a file of JSON lines that this command wrote")
         other = [
             f"{name} was {theirs.get(name)}, is {value}" for name, value in ours.items() if theirs.get(name) != value
         ]

@@ -27,7 +27,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import outputs as outputs_module
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.live_parameters import ParameterError
-from sq_perception.nodes.outputs import MarkerIds, OptionalOutputs, in_frame
+from sq_perception.nodes.outputs import OptionalOutputs, in_frame
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
@@ -416,29 +416,13 @@ def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
     assert in_frame(here, CameraPoses(node), "") is here
 
 
-def test_markers_that_are_gone_are_deleted_for_a_while_and_all_of_them_at_once(monkeypatch):
-    now = [100.0]
-    monkeypatch.setattr(outputs_module, "monotonic", lambda: now[0])
-    ids = MarkerIds()
-    assert ids.replace_markers([1, 2]) == []
-    now[0] += 60
-    assert [ids.replace_markers([1]), ids.replace_markers([1])] == [[2], [2]], "however long they were shown"
-    assert [ids.replace_markers([2]), ids.replace_markers([2])] == [[1], [1]], "2 is back"
-    now[0] += 10.5
-    assert ids.replace_markers([2]) == []
-    ids.replace_markers(range(50))
-    assert sorted(ids.replace_markers([])) == list(range(50))
-    assert 0 < len(ids.replace_markers([])) < 50
-
-
 def test_markers_lie_on_the_bodies(node):
     """Meshes in the body's frame and back again are those of the body in the frame of the image."""
-    array = found(1, 2).markers((1, 2, 8))
-    assert [(marker.id, marker.ns.split("/")[1], marker.action) for marker in array.markers] == [
+    shown = found(1, 2).markers().markers[1:]
+    assert [(marker.id, marker.ns.split("/")[1], marker.action) for marker in shown] == [
         *((1, "surface", 0), (1, "outline", 0), (2, "surface", 0), (2, "outline", 0)),
-        *((8, "surface", 2), (8, "outline", 2)),
     ]
-    for marker, body in zip(array.markers[:4], (CAN, CAN, BOX, BOX), strict=True):
+    for marker, body in zip(shown, (CAN, CAN, BOX, BOX), strict=True):
         points = np.array([[p.x, p.y, p.z] for p in marker.points])
         np.testing.assert_allclose(body.gauge(points), 1, atol=1e-4)
 

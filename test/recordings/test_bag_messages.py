@@ -19,7 +19,7 @@ from sq_msgs_py.message_types import installed
 from sq_msgs_py.superquadrics import FIELDS, SuperquadricArray
 from sq_perception.geometry.mesh import mesh, outline
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.recordings import bag_messages
+from sq_perception.recordings import result_bag
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 KINDS = ("CameraInfo", "DepthImage", "GreyImage", "LabelImage", "PointCloud2", "EmptyCloud", "MarkerArray")
@@ -50,7 +50,7 @@ def make(kind, types):
         [[0.1, 0.2, 0.3]] * 2, [[0.3, 0.8], [1.0, 1.0]], rng.normal(size=(2, 3)), [[0, 0, 0, 1.0]] * 2
     )
     meshes = [(mesh(one, 16).vertices, mesh(one, 16).faces, outline(one)) for one in (shapes[0], shapes[1])]
-    return markers(meshes, [3, 8], at, previous_ids=[2, 3, 9], types=types)
+    return markers(meshes, [3, 8], at, types=types)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -59,8 +59,8 @@ def test_the_bytes_are_those_that_rclpy_makes(kind):
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     from rclpy.serialization import deserialize_message, serialize_message
 
-    live, recorded = make(kind, installed), make(kind, bag_messages.types)
-    data, reference = bag_messages.as_cdr(recorded), serialize_message(live)
+    live, recorded = make(kind, installed), make(kind, result_bag.types)
+    data, reference = result_bag.as_cdr(recorded), serialize_message(live)
     assert len(data) == len(reference)
     assert data == TYPES.serialize_cdr(TYPES.deserialize_cdr(reference, recorded.__msgtype__), recorded.__msgtype__)
     assert deserialize_message(data, type(live)) == deserialize_message(reference, type(live))
@@ -76,38 +76,38 @@ def test_constants_are_those_of_ros():
     assert {getattr(field, names[kind]): kind for kind in names} == columns._NUMPY_TYPES
     assert {kind for _, kind in FIELDS} == {field.FLOAT32, field.UINT32}
     assert (module._TRIANGLE_LIST, module._LINE_LIST) == (marker.TRIANGLE_LIST, marker.LINE_LIST)
-    assert (module._ADD, module._DELETE) == (marker.ADD, marker.DELETE)
+    assert (module._ADD, module._DELETE_ALL) == (marker.ADD, marker.DELETEALL)
 
 
 def test_a_recorded_cloud_is_read_by_the_code_that_reads_a_live_one(rng):
     before = random_bodies(4, rng)
-    data = bag_messages.as_cdr(superquadrics.to_message(before, header(bag_messages.types), bag_messages.types))
+    data = result_bag.as_cdr(superquadrics.to_message(before, header(result_bag.types), result_bag.types))
     after = superquadrics.from_message(TYPES.deserialize_cdr(data, "sensor_msgs/msg/PointCloud2"))
     for column in vars(before):
         np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
 
 
 def test_fields_left_out_have_the_defaults_of_ros():
-    marker = bag_messages.types("visualization_msgs/msg/Marker")(id=3)
+    marker = result_bag.types("visualization_msgs/msg/Marker")(id=3)
     assert (marker.id, marker.ns, marker.pose.orientation.w, marker.pose.position.z) == (3, "", 1.0, 0.0)
     assert marker.points == []
-    camera = bag_messages.types("sensor_msgs/msg/CameraInfo")()
+    camera = result_bag.types("sensor_msgs/msg/CameraInfo")()
     assert [len(one) for one in (camera.d, camera.k, camera.r, camera.p)] == [0, 9, 9, 12]
     with pytest.raises(TypeError):
-        bag_messages.types("visualization_msgs/msg/Marker")(identity=3)
+        result_bag.types("visualization_msgs/msg/Marker")(identity=3)
     with pytest.raises(KeyError):
-        bag_messages.types("nobody_msgs/msg/Nothing")
+        result_bag.types("nobody_msgs/msg/Nothing")
 
 
 def test_numbers_are_taken_as_lists_and_arrays():
-    info = bag_messages.types("sensor_msgs/msg/CameraInfo")
+    info = result_bag.types("sensor_msgs/msg/CameraInfo")
     numbers = [float(k) for k in range(9)]
-    made = [bag_messages.as_cdr(info(k=one)) for one in (numbers, array.array("d", numbers), np.array(numbers))]
+    made = [result_bag.as_cdr(info(k=one)) for one in (numbers, array.array("d", numbers), np.array(numbers))]
     assert made[0] == made[1] == made[2]
     np.testing.assert_array_equal(TYPES.deserialize_cdr(made[0], "sensor_msgs/msg/CameraInfo").k, numbers)
 
 
 def test_definitions_name_all_that_a_message_contains():
-    text = bag_messages.definition("visualization_msgs/msg/MarkerArray")
+    text = result_bag.definition("visualization_msgs/msg/MarkerArray")
     parts = {line.removeprefix("MSG: ") for line in text.splitlines() if line.startswith("MSG: ")}
     assert {"visualization_msgs/Marker", "std_msgs/Header", "geometry_msgs/Point", "builtin_interfaces/Time"} <= parts

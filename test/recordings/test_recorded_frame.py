@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
@@ -190,7 +191,7 @@ def test_what_the_system_refuses_is_named(tmp_path, info, monkeypatch, error):
     def refused(*_, **__):
         raise error
 
-    monkeypatch.setattr(np, "fromfile", refused)
+    monkeypatch.setattr(Image, "open", refused)
     with pytest.raises(FrameError, match=re.escape(str(error))):
         read(tmp_path / "depth.png", info)
     if isinstance(error, OSError):

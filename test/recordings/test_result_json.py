@@ -100,10 +100,13 @@ def test_two_programs_do_not_share_a_file(path):
     lines.close()
 
 
-def test_a_full_disk_leaves_whole_lines(path, file_size_limit):
+def test_what_a_full_disk_cut_short_is_written_again(path, file_size_limit):
     lines, before = ResultLines(path, OPTIONS), path.read_bytes()
-    with file_size_limit(len(before) + 20), pytest.raises(OSError, match=f"too large: '{path}'"):
-        lines.add(entry(2))
+    with file_size_limit(len(before) + 20):
+        with pytest.raises(OSError, match=f"too large: '{path}'"):
+            lines.add(entry(2))
+        lines.close()
+    lines = ResultLines(path, OPTIONS)
     assert path.read_bytes() == before
     lines.add(entry(2))
     lines.close()

@@ -15,7 +15,7 @@ from builtin_interfaces.msg import Time
 from random_bodies import random_bodies
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
-from visualization_msgs.msg import Marker, MarkerArray
+from visualization_msgs.msg import Marker
 
 from sq_msgs_py import superquadrics
 from sq_msgs_py.markers import PALETTE, markers
@@ -196,13 +196,10 @@ TETRAHEDRON = (
 )
 
 
-def actions(array_message: MarkerArray) -> dict[tuple[str, int], int]:
-    return {(marker.ns, marker.id): marker.action for marker in array_message.markers}
-
-
 def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
     message = markers([TETRAHEDRON], [5], HEADER, namespace="body", alpha=0.5)
-    surface, outline = message.markers
+    before, surface, outline = message.markers
+    assert before.action == Marker.DELETEALL
     assert (surface.ns, surface.id, surface.type, surface.action) == (
         "body/surface",
         5,
@@ -217,22 +214,10 @@ def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
     assert outline.scale.x == 0.002
     assert surface.color.a == 0.5
     assert np.float32([surface.color.r, surface.color.g, surface.color.b]) == pytest.approx(np.float32(PALETTE[5]))
-    for marker in message.markers:
+    for marker in (surface, outline):
         assert marker.header == HEADER
         assert marker.pose.orientation.w == 1.0
         assert marker.color.a > 0
-
-
-def test_stale_markers_are_deleted_and_no_others() -> None:
-    message = markers([TETRAHEDRON], [2], HEADER, namespace="n", previous_ids=[2, 9])
-    assert actions(message) == {
-        ("n/surface", 2): Marker.ADD,
-        ("n/outline", 2): Marker.ADD,
-        ("n/surface", 9): Marker.DELETE,
-        ("n/outline", 9): Marker.DELETE,
-    }
-    assert set(actions(markers([], [], HEADER, previous_ids=[1])).values()) == {Marker.DELETE}
-    assert actions(markers([], [], HEADER)) == {}
 
 
 @pytest.mark.parametrize(
