@@ -6,8 +6,6 @@ A supervisor starts the killed process again at once, as a launch file with ``re
 start to the first result that needs the process: of an image that was taken after it.  Meanwhile the others must not
 fall silent: results where the viewer was killed, camera_infos where the node was, diagnoses where the camera was.
 A process that does not come back within 30 s counts as never back (the reasons: test/helpers/respawned_nodes.py).
-Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start
-of one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
 """
 
 from __future__ import annotations
@@ -21,10 +19,8 @@ from common import (
     own_domain,  # noqa: F401
     report,
 )
-from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
+from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot
 from running_nodes import Peer
-
-from sq_perception.nodes.fast_dds import remove_orphans
 
 ASKED = 5.0
 """Seconds to the first result after a restart."""
@@ -45,8 +41,6 @@ def main() -> None:
     rng = np.random.default_rng(options.seed)
     # An equal share of each, in a random order.
     order = rng.permutation(np.resize(MEMBERS, options.kills))
-    freed = remove_orphans()
-    before = set(orphans())
     kills: list[Kill] = []
     with (
         Peer() as peer,
@@ -54,7 +48,6 @@ def main() -> None:
             peer,
             camera=(f"rate:={options.rate}", f"objects:={options.objects}", "hold:=15"),
             node=options.node,
-            parameters=("free_shared_memory:=true",),
         ) as robot,
     ):
         for member in order:
@@ -62,8 +55,6 @@ def main() -> None:
             kills.append(robot.kill(str(member)))
             print(kills[-1], flush=True)
     left = robot.left()
-    time.sleep(1.0)
-    dead = set(orphans()) - before
     rows = []
     for member in MEMBERS:
         chosen = [kill for kill in kills if kill.member == member]
@@ -81,20 +72,12 @@ def main() -> None:
                 "met": "yes" if good else "NO",
             }
         )
-    most = max(kill.orphans for kill in kills)
-    summary = (
-        f"Processes left: {len(left)}. Segments of dead owners: {len(before)} before, at most {most} during, "
-        f"{len(dead)} new ones after the end."
-    )
     result = {
         "options": vars(options),
         "kills": [{**asdict(kill), "back": kill.back if np.isfinite(kill.back) else None} for kill in kills],
         "processes_left": left,
-        "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
-        "freed_before": len(freed),
     }
-    report.write(options.name, result, f"{report.table_of(rows)}\n\n{summary}")
-    remove_orphans()
+    report.write(options.name, result, f"{report.table_of(rows)}\n\nProcesses left: {len(left)}.")
     sys.exit(0 if not left and all(row["met"] == "yes" for row in rows) else 1)
 
 

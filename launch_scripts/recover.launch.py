@@ -22,7 +22,7 @@ from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
 from sq_msgs_py.transforms import prefix_in
-from sq_perception.nodes import fast_dds
+from sq_perception.nodes import process
 
 ARGUMENTS = {
     "depth": ("depth/image", "topic of the depth images"),
@@ -58,7 +58,7 @@ def generate_launch_description() -> LaunchDescription:
     """Called by ros2 launch."""
     declared = [DeclareLaunchArgument(name, default_value=value, description=text)
                 for name, (value, text) in ARGUMENTS.items()]  # fmt: skip
-    profile = [SetEnvironmentVariable(name, value) for name, value in fast_dds.additions().items()]
+    profile = [SetEnvironmentVariable(name, value) for name, value in process.additions().items()]
     return LaunchDescription([*declared, *profile, OpaqueFunction(function=_nodes)])
 
 

@@ -1,8 +1,7 @@
-"""The recoverer of a frame node: made in its own thread, replaced as a whole, shared by the nodes of a process.
+"""The recoverer of a frame node, shared by the nodes of a process.
 
-After a change of its parameters (model, device ...) a new recoverer is made and warmed up in its own thread.  Frames
-use the old one, with the old parameters, until the new one is ready.  If it cannot be made, the old one stays active
-and :attr:`Engine.fault` has the reason.
+After a change of its parameters (model, device ...) the next frame waits for another one.  If that cannot be made, the
+old one stays active and :attr:`Engine.fault` has the reason.
 
 Nodes of one process share equal recoverers.  A process computes one frame at a time, in the order of requests
 (:class:`Turns`): a frame already uses every core, so two at once would each take twice as long.
@@ -13,7 +12,7 @@ from __future__ import annotations
 import threading
 import weakref
 from collections import deque
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -35,8 +34,6 @@ from sq_perception.segmentation.options import Pose
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _MADE_OF = ("device", "threads", "method", "model")
 """Parameters that determine a recoverer."""
-_READ_BY = frozenset(("model", "device"))
-"""Parameters that reload the weights when they are set; a change of others keeps the loaded ones."""
 
 Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 """The bodies of a frame, and a value that is equal for equal origins."""
@@ -82,7 +79,6 @@ class Turns:
 TURNS = Turns()
 """The lock of this process."""
 _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
-_making = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -95,77 +91,62 @@ class _Built:
 
 
 class Engine:
-    """The active recoverer of a node, which logs swaps; see the module."""
+    """The active recoverer of a node; see the module."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._lock = threading.Lock()
         self._built: _Built | None = None
         self._last: dict[Hashable, Reference] = {}
         """State that the last frame leaves for the next, by its frame_id and origin."""
-        self._request = 0
-        self._is_to_read = False
-        """Whether requested weights have not been read yet."""
-        self.is_making = False
-        """Whether another recoverer is being made."""
+        self._is_due = False
+        """Whether a parameter was set that may need another recoverer."""
         self.fault = ""
         """Why the last change failed; empty once one has succeeded."""
 
     def build(self, parameters: RecoverParameters) -> None:
         """Make and warm up the recoverer.  Raises ValueError if the model or the device cannot be used."""
         self.release()
-        self._built = _make(parameters, None, lambda: True)
+        with TURNS.turn():
+            self._built = _make(parameters)
 
     def release(self) -> None:
-        """Release the recoverer, and one that is being made."""
-        with self._lock:
-            self._request += 1
-            self._built, self._last, self._is_to_read = None, {}, False
-            self.is_making, self.fault = False, ""
+        """Release the recoverer."""
+        self._built, self._last, self._is_due, self.fault = None, {}, False, ""
 
     def discard(self) -> None:
         """Stop sharing the recoverer, since it has failed repeatedly."""
-        with _making:
-            if self._built is not None and _shared.get(self._built.key) is self._built.recoverer:
-                del _shared[self._built.key]
+        if self._built is not None and _shared.get(self._built.key) is self._built.recoverer:
+            del _shared[self._built.key]
 
     def check(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
-        """Raise ValueError for parameters that :meth:`follow` could not apply, as far as this is known at once."""
+        """Raise ValueError for parameters of which no recoverer could be made, as far as this is known at once."""
         if "device" in changed:
             inference.check_device(parameters.device)
-        reads = not changed.isdisjoint(_READ_BY)
-        if self._built is not None and "method" in changed:
-            reads = reads or not self._built.recoverer.has_weights
-        if "model" in changed or (reads and self._built is not None and parameters.method in NEEDS_NETWORK):
+        is_read = self._built is not None and parameters.method in NEEDS_NETWORK and changed & {"device", "method"}
+        if "model" in changed or is_read:
             try:
                 checkpoint.check(parameters.model or None)
             except ValueError as error:
                 raise ValueError(f"model: {error}") from error
 
     def follow(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
-        """Replace the recoverer in the background if one of its parameters has changed.
-
-        A set that leaves the value as it is counts too: it is how a model file that was replaced is read again.
-        """
-        if not changed.intersection(_MADE_OF) or self._built is None:
-            return
-        with self._lock:
-            self._request += 1
-            self.is_making = True
-            self._is_to_read = self._is_to_read or not changed.isdisjoint(_READ_BY)
-            work = self._request, parameters, None if self._is_to_read else self._built
-        threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
+        """Note which parameters were set, if to the value that they had: so a model file that was replaced is read."""
+        self._is_due = self._is_due or not changed.isdisjoint(_MADE_OF)
 
     def recover(self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None) -> Answer:
         """Return the bodies of a frame with the current parameters, and a value that is equal for equal origins.
 
-        ``pose`` is that of the frame in ``target_frame``, if there is one.  With ``tracking``, what did not change
-        since the last frame is taken from its answer, if camera and origin are the same.
+        For the holder of the turn.  ``pose`` is that of the frame in ``target_frame``, if there is one.  With
+        ``tracking``, what did not change since the last frame is taken from its answer, if camera and origin are the
+        same.
         """
+        if self._is_due:
+            self._is_due = False
+            self._replace(parameters)
         built = self._built
         if built is None:
             raise RuntimeError("the recoverer has been released")
-        method = built.parameters.method  # others may be set already, and still in the making
+        method = built.parameters.method  # another one may be set that cannot be had
         origin = built.weights, method
         key = frame.header.frame_id, origin
         last = self._last.get(key) if parameters.tracking else None
@@ -178,54 +159,31 @@ class Engine:
     @property
     def description(self) -> str:
         """Describe the active recoverer for diagnostics."""
-        if (built := self._built) is None:
-            return "none"
-        return _describe(built.parameters) + (", another one is being made" if self.is_making else "")
+        return "none" if (built := self._built) is None else _describe(built.parameters)
 
-    def _swap(self, request: int, parameters: RecoverParameters, kept: _Built | None) -> None:
+    def _replace(self, parameters: RecoverParameters) -> None:
         started, log = perf_counter(), self._node.get_logger()
-        built, fault = None, ""
         try:
-            built = _make(parameters, kept, lambda: request == self._request)
-        except Exception as error:  # whatever it is: the old one goes on
-            fault = f"cannot change to {_describe(parameters)}: {' '.join(str(error).split())}"
-        with self._lock:
-            if request != self._request:  # another one is wanted by now
-                return
-            self.is_making, self.fault = False, fault
-            if built is not None:
-                self._built, self._is_to_read = built, False
-        if fault:
-            log.error(f"{fault}; the previous one stays active")
-        else:
+            self._built, self.fault = _make(parameters), ""
             log.info(f"changed to {_describe(parameters)} within {perf_counter() - started:.1f} s")
+        except Exception as error:  # whatever it is: the old one goes on
+            self.fault = f"cannot change to {_describe(parameters)}: {' '.join(str(error).split())}"
+            log.error(f"{self.fault}; the previous one stays active")
 
 
-def _make(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
-    """Return a warm recoverer, with the weights of ``kept`` if given; an existing one if it is equivalent.
-
-    None if it is no longer wanted.
-    """
-    weights = _file(parameters.model) if kept is None else kept.weights
+def _make(parameters: RecoverParameters) -> _Built:
+    """Return a warm recoverer, an existing one if it is equivalent."""
+    weights = _file(parameters.model)
     # Without the model: the same file may have several names.
     key = (weights, *(getattr(parameters, name) for name in _MADE_OF if name != "model"))
-    with _making:
-        if not is_wanted():
-            return None
-        if (known := _shared.get(key)) is not None:
-            return _Built(known, parameters, weights, key)
-        recoverer = _shared[key] = Recoverer(
-            parameters.model or None,
-            parameters.device,
-            parameters.method,
-            parameters.threads or None,
-            weights_of=None if kept is None else kept.recoverer,
+    recoverer = _shared.get(key)
+    if recoverer is None:
+        recoverer = Recoverer(
+            parameters.model or None, parameters.device, parameters.method, parameters.threads or None
         )
-    with TURNS.turn():
-        if not is_wanted():
-            return None
         still_scene.warm_up()
         recoverer.warm_up(unit_cube.camera() if parameters.projection == "orthographic" else WARM_UP_CAMERA)
+        _shared[key] = recoverer
     return _Built(recoverer, parameters, weights, key)
 
 

@@ -21,7 +21,7 @@ import re
 from collections.abc import Iterator, Sequence
 from functools import partial
 
-from sq_perception.nodes import fast_dds, process
+from sq_perception.nodes import process
 
 _USAGE = "ros2 run sq_perception %(prog)s{} [--ros-args -p NAME:=VALUE --params-file FILE -r TOPIC:=OTHER ...]"
 _ABOUT = {
@@ -103,7 +103,7 @@ def _before_ros(arguments: list[str]) -> list[str]:
 def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
     """Make a parser that refuses unknown arguments; its help lists the parameters with their defaults."""
     kind = name.replace("recover_cameras", "recover_node")
-    parameters = fast_dds.configuration_file(f"{kind}.yaml").read_text(encoding="utf-8")
+    parameters = process.configuration_file(f"{kind}.yaml").read_text(encoding="utf-8")
     return argparse.ArgumentParser(
         prog=name,
         usage=_USAGE.format(positional),

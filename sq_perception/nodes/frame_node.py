@@ -18,7 +18,6 @@ import math
 import threading
 import traceback
 from collections.abc import Mapping
-from dataclasses import fields
 from time import monotonic, perf_counter
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -32,7 +31,7 @@ from std_srvs.srv import SetBool, Trigger
 from sq_msgs_py import answers
 from sq_perception.geometry import kernel_cache
 from sq_perception.imaging import unit_cube
-from sq_perception.nodes import fast_dds, process
+from sq_perception.nodes import process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
@@ -123,20 +122,13 @@ class FrameNode(ManagedNode):
 
     def _configure(self) -> None:
         parameters = self._settings.current
-        if parameters.free_shared_memory:
-            freed = fast_dds.remove_orphans()
-            self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
         kernel_cache.compile_beside()
         self._engine.build(parameters)
         association.warm_up()
-        latest = self._settings.current
-        meanwhile = {
-            field.name for field in fields(latest) if getattr(latest, field.name) != getattr(parameters, field.name)
-        }
-        self._engine.follow(latest, frozenset(meanwhile))
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
+        latest = self._settings.current
         self._outputs.open(latest)
         if latest.fixed_frame or latest.target_frame or latest.camera_frame:
             self._poses.listen()
@@ -176,9 +168,8 @@ class FrameNode(ManagedNode):
                 self.get_logger().warning("the current frame takes long; it is the last one and is not published")
 
     def close(self) -> bool:
-        """Close as :meth:`ManagedNode.close`; also False while a frame or a model change is in progress."""
-        is_still = super().close()
-        return is_still and not self._engine.is_making and (self._worker is None or not self._worker.is_alive())
+        """Close as :meth:`ManagedNode.close`; also False while a frame is in progress."""
+        return super().close() and (self._worker is None or not self._worker.is_alive())
 
     def destroy_node(self) -> None:
         """As rclpy's, with the action."""

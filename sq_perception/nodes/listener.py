@@ -2,19 +2,15 @@
 
 Keep last 1.  A best effort subscription receives every publisher, but loses large messages that do not fit into the
 publisher's shared memory: of VGA depth images, four in five.  A reliable subscription loses none, but receives no best
-effort publisher.  So a listener is reliable while all publishers of its topic are, and best effort otherwise; it checks
-again when one appears or leaves.  DDS cannot change a live subscription: a new one replaces it, and both listen until
-the publishers have found it, so that no message is lost; duplicates are passed on once.  If
+effort publisher.  So a listener is reliable while no publisher of its topic is best effort; it checks again when one
+appears or leaves.  DDS cannot change a live subscription: a new one replaces it.  If
 ``qos_overrides.<topic>.subscription.reliability`` is reliable or best_effort, that takes precedence.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
-from functools import partial
-from time import monotonic
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor
@@ -24,8 +20,8 @@ from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSProfile, QoSReliabilit
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from sq_perception.nodes import fast_dds
-from sq_perception.nodes.frame import newest, stamp_of
+from sq_perception.nodes import process
+from sq_perception.nodes.frame import newest
 from sq_perception.nodes.statistics import THROTTLE, Statistics
 
 _RELIABILITIES = {
@@ -34,10 +30,6 @@ _RELIABILITIES = {
     "best_effort": QoSReliabilityPolicy.BEST_EFFORT,
 }
 """Values of the override, as rmw names them; None follows the publishers."""
-_OVERLAP = 1.0
-"""Seconds for which a subscription outlives its replacement, which a publisher may find late."""
-_REMEMBERED = 8
-"""Messages that are remembered during that time: more than are in transit at once."""
 
 
 class Listener:
@@ -57,16 +49,10 @@ class Listener:
         self.topic = str(node.resolve_topic_name(topic))
         """The resolved name."""
         self._asked = _reliability_override(node, self.topic)
-        self._heard: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
-        """Stamps of the last messages, and the subscription that received them."""
-        self._count, self._since = 0, 0.0
-        """Number of subscriptions so far, and the time of the last one."""
         self._lock = threading.Lock()
-        """Guards the subscriptions: they are replaced in the executor's thread and closed in another one."""
-        self._subscriptions: list[Subscription] = []
-        """The current subscription last; before it the one that it replaces."""
-        with self._lock:
-            self._subscribe(self._choose_reliability())
+        """Guards the subscription: it is replaced in the executor's thread and closed in another one."""
+        self._subscription: Subscription | None = None
+        self._subscribe(self._choose_reliability())
 
     @property
     def qos(self) -> QoSProfile:
@@ -88,83 +74,63 @@ class Listener:
         return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"
 
     def follow(self) -> None:
-        """Subscribe as the publishers now offer, and end a subscription that was replaced some time ago."""
+        """Subscribe as the publishers now offer."""
+        wanted = self._choose_reliability()
         with self._lock:
-            if len(self._subscriptions) > 1 and monotonic() - self._since > _OVERLAP:
-                self._node.destroy_subscription(self._subscriptions.pop(0))
-        self._follow_publishers()
+            if (replaced := self._subscription) is not None and wanted != self._qos.reliability:
+                self._subscribe(wanted)
+                self._node.destroy_subscription(replaced)
 
     def close(self) -> None:
         """Stop listening."""
         with self._lock:
-            for subscription in self._subscriptions:
-                self._node.destroy_subscription(subscription)
-            self._subscriptions = []
-
-    def _follow_publishers(self) -> None:
-        wanted = self._choose_reliability()
-        with self._lock:
-            if len(self._subscriptions) == 1 and wanted != self._qos.reliability:
-                self._subscribe(wanted)
+            if self._subscription is not None:
+                self._node.destroy_subscription(self._subscription)
+            self._subscription = None
 
     def _choose_reliability(self) -> QoSReliabilityPolicy:
-        if self._asked is not None:
-            return self._asked
-        offered = {one.qos_profile.reliability for one in self._node.get_publishers_info_by_topic(self.topic)}
-        reliable = QoSReliabilityPolicy.RELIABLE
-        return reliable if offered == {reliable} else QoSReliabilityPolicy.BEST_EFFORT
+        offered = [one.qos_profile.reliability for one in self._node.get_publishers_info_by_topic(self.topic)]
+        best_effort = QoSReliabilityPolicy.BEST_EFFORT
+        return self._asked or (best_effort if best_effort in offered else QoSReliabilityPolicy.RELIABLE)
 
     def _subscribe(self, reliability: QoSReliabilityPolicy) -> None:
-        self._count, self._since = self._count + 1, monotonic()
-        self._heard.clear()
         self._qos = newest()
         self._qos.reliability = reliability
         events = SubscriptionEventCallbacks(
-            matched=lambda _: self._follow_publishers(),
+            matched=lambda _: self.follow(),
             incompatible_qos=lambda _: self._on_incompatible(),
             message_lost=self._on_message_lost,
         )
         overridable = QoSOverridingOptions(policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH))
-        made = self._node.create_subscription(
+        self._subscription = self._node.create_subscription(
             self._kind,
             self.topic,
-            partial(self._on_message, self._count),
+            self._callback,
             self._qos,  # rclpy writes the overrides into it
             event_callbacks=events,
             qos_overriding_options=overridable,
         )
-        self._subscriptions.append(made)
-
-    def _on_message(self, number: int, message: Any) -> None:
-        if len(self._subscriptions) > 1 and (stamp := stamp_of(message)):
-            if any(known == stamp and by != number for known, by in self._heard):
-                return
-            self._heard.append((stamp, number))
-        self._callback(message)
 
     def _on_incompatible(self) -> None:
         if self._asked is None:
-            self._follow_publishers()
+            self.follow()
         else:
             self._node.get_logger().warning(f"{self.topic}: {self.publishers}", throttle_duration_sec=THROTTLE)
 
     def _on_message_lost(self, event: Any) -> None:
-        self._on_lost(event.total_count, event.total_count_change)
-
-    def _on_lost(self, total: int, new: int) -> None:
-        self._statistics.lose(self.topic, new)
+        self._statistics.lose(self.topic, event.total_count_change)
         if self._qos.reliability == QoSReliabilityPolicy.BEST_EFFORT:
             remedy = (
                 "best effort messages that do not fit into the shared memory which Fast DDS reserves are lost. Make "
                 "the PUBLISHER (the camera driver) reliable, or start it with "
-                f"{fast_dds.VARIABLE}={fast_dds.profile_path()}"
+                f"{process.PROFILE}={process.profile_path()}"
             )
         else:
             remedy = (
                 "a reliable publisher's queue was full before they were delivered. Raise the depth of the PUBLISHER "
                 f"(the camera driver), or set qos_overrides.{self.topic}.subscription.reliability to best_effort"
             )
-        text = f"{total} messages of {self.topic} lost before they arrived: {remedy}"
+        text = f"{event.total_count} messages of {self.topic} lost before they arrived: {remedy}"
         self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE)
 
 

@@ -51,9 +51,6 @@ class RecoverParameters(Parameters):
     """Parameters of recover_node, and of each node of recover_cameras."""
 
     autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
-    free_shared_memory: bool = setting(
-        False, "Delete the shared memory that killed processes of this user have left behind.", live=False
-    )
     projection: Projection = setting(
         "pinhole",
         "pinhole: 16UC1 and 32FC1 with camera_info; orthographic: mono8 and mono16 images of the unit cube.",

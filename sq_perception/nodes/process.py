@@ -1,8 +1,11 @@
 """The process of one or several nodes: start, spin and stop without a traceback.
 
 Exit code 0 after Ctrl-C, SIGTERM or the end of the terminal, also twice or while a node starts; 1 with one line of
-explanation if a node cannot start.  The shipped Fast DDS profile is used unless the user has set one.  One thread spins
-all nodes: callbacks only store messages, other threads do the work.
+explanation if a node cannot start.  One thread spins all nodes: callbacks only store messages, others do the work.
+
+The shipped Fast DDS profile, which prevents the loss of large images, is used unless the user has set one.  Fast DDS 2
+of Jazzy reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so the variable must
+be set before rclpy.init; it ignores its successor's variable, FASTDDS_DEFAULT_PROFILES_FILE.
 
 Garbage collection: numba and SciPy make 100 000 objects that live as long as the process.  During their import 260
 collections would free almost nothing and take 0.13 of 1.1 seconds; later each full collection would take 60 ms, in the
@@ -21,14 +24,14 @@ import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
-
-from sq_perception.nodes import fast_dds
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
+PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 """Spinning threads take cores from other nodes: on two busy cores a frame took 30 ms with these settings and 50 to 150
@@ -78,7 +81,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
     try:
         try:
             # Libraries read these when they are loaded, rclpy already loads numpy.
-            for variable, value in {**_THREADS, **fast_dds.additions()}.items():
+            for variable, value in {**_THREADS, **additions()}.items():
                 os.environ.setdefault(variable, value)
             share_heaps()
             with garbage_postponed():
@@ -118,6 +121,25 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             signal.signal(number, signal.SIG_IGN)
         _finish(nodes, code)
     return code
+
+
+def configuration_file(name: str) -> Path:
+    """Return a shipped file: beside the modules if installed, in ``config/`` of a source tree."""
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package / "config", package.parent / "config"):
+        if (folder / name).is_file():
+            return folder / name
+    raise FileNotFoundError(f"{name} is missing beside {package}: install the package again")
+
+
+def profile_path() -> Path:
+    """Return the path of the shipped Fast DDS profile."""
+    return configuration_file("fast_dds.xml")
+
+
+def additions() -> dict[str, str]:
+    """Return what to add to the environment: the variable of the shipped profile, or nothing if a profile is set."""
+    return {} if os.environ.get(PROFILE) else {PROFILE: str(profile_path())}
 
 
 def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:

@@ -126,8 +126,6 @@ class Recoverer:
         later call asks for one, it is loaded then.
     threads
         How many objects of a frame are worked on at the same time; None: as many as this process has cores.
-    weights_of
-        Another recoverer, whose loaded weights are taken if it has any; the file is not read then.
 
     Raises
     ------
@@ -145,8 +143,6 @@ class Recoverer:
         device: str = "cpu",
         method: Method = "auto",
         threads: int | None = None,
-        *,
-        weights_of: Recoverer | None = None,
     ) -> None:
         if not isinstance(model, str | Path | None):
             given = type(model).__name__
@@ -157,8 +153,8 @@ class Recoverer:
         self._options = RecoveryOptions(method=method)
         self._path = model
         self._device = inference.check_device(device)
-        self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
-        self._masks: CompactMasks | None = None if weights_of is None else weights_of._masks
+        self._loaded: dict[bool, Network] = {}
+        self._masks: CompactMasks | None = None
         self._begin()
         if method in NEEDS_NETWORK:
             self._load_network(method == "auto")
@@ -170,11 +166,6 @@ class Recoverer:
         self._process = os.getpid()
         self._lock = threading.Lock()
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
-
-    @property
-    def has_weights(self) -> bool:
-        """Whether the network has been loaded: its file is needed no more."""
-        return bool(self._loaded)
 
     def warm_up(self, camera: Camera) -> None:
         """Compile or load every kernel and run the whole chain once on an image of the camera's size."""

@@ -50,8 +50,6 @@ def info_of(camera: Camera, header: Header) -> CameraInfo:
 class Recoverer:
     """Notes what it is asked, and answers ``bodies``, or raises, once ``gate`` is open."""
 
-    has_weights = True
-
     def __init__(self) -> None:
         self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
         self.bodies: tuple[Recovery, ...] = (ball(),)

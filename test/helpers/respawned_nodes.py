@@ -6,7 +6,6 @@ the first result that needs the killed process, and the longest silence of those
 
 from __future__ import annotations
 
-import fcntl
 import math
 import os
 import signal
@@ -23,8 +22,6 @@ from typing import Any
 from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
 from started_nodes import Child
-
-from sq_perception.nodes.fast_dds import FOLDER
 
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"
 MEMBERS = (CAMERA, NODE, VIEWER)
@@ -99,8 +96,6 @@ class Kill:
     member: str
     back: float
     silence: float
-    segments: int
-    orphans: int
 
 
 class Robot:
@@ -165,7 +160,7 @@ class Robot:
         assert {name: self.running[name].pid for name in others} == others
         for name in others:
             assert self.running[name].exit_code is None, f"the {name} ended with the {member}"
-        return Kill(member, back, self._silence(member, began, ended), len(segments()), len(orphans()))
+        return Kill(member, back, self._silence(member, began, ended))
 
     def _wait(self, member: str, started: float) -> float:
         wall = time.time() - (time.monotonic() - started)
@@ -206,23 +201,3 @@ class Robot:
     def left(self) -> list[int]:
         """Processes that were ever started and still exist."""
         return [pid for pid in self.pids if Path(f"/proc/{pid}").exists()]
-
-
-def orphans() -> list[str]:
-    """Names of those whose owner is dead: nobody holds the lock beside them."""
-    return [name for name in segments() if (FOLDER / f"{name}_el").exists() and not _is_locked(FOLDER / f"{name}_el")]
-
-
-def _is_locked(path: Path) -> bool:
-    with path.open("rb") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except OSError:
-            return True
-    return False
-
-
-def segments() -> list[str]:
-    """Names of the segments of all participants of this machine."""
-    names = os.listdir(FOLDER) if FOLDER.is_dir() else []
-    return [name for name in names if name.startswith("fastrtps_") and len(name) == len("fastrtps_") + 16]

@@ -26,7 +26,7 @@ from std_msgs.msg import Header
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import fast_dds
+from sq_perception.nodes import process
 from sq_perception.simulation.scenes import Scene
 
 PATIENCE = 90.0
@@ -43,7 +43,7 @@ BODIES = Superquadric(
 
 def environment(**more: str) -> dict[str, str]:
     """What the processes of nodes get: this one's environment, the shipped Fast DDS profile, and ``more``."""
-    return {**os.environ, **fast_dds.additions(), "RCUTILS_COLORIZED_OUTPUT": "0", **more}
+    return {**os.environ, **process.additions(), "RCUTILS_COLORIZED_OUTPUT": "0", **more}
 
 
 def arguments(*parameters: str, remap: Sequence[str] = ()) -> list[str]:
@@ -116,7 +116,7 @@ class Peer:
     """A node in this process, spun in the background, that publishes, listens and calls."""
 
     def __init__(self) -> None:
-        os.environ.update(fast_dds.additions())
+        os.environ.update(process.additions())
         self._spun = SpunNodes()
         self.node = self._spun.peer
         self._publishers: dict[str, Any] = {}

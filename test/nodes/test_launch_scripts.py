@@ -20,7 +20,7 @@ import pytest
 
 pytest.importorskip("launch_ros", reason="launch comes with a ROS installation")
 
-from sq_perception.nodes import fast_dds
+from sq_perception.nodes import process
 from sq_perception.nodes.executables import PROGRAMS
 
 PATIENCE = 120.0
@@ -69,7 +69,7 @@ class Launch:
         marks.mkdir(parents=True, exist_ok=True)
         (marks / name).touch()
         for program in programs:
-            text = NOTING.format(python=sys.executable, folder=str(self._folder), variable=fast_dds.VARIABLE)
+            text = NOTING.format(python=sys.executable, folder=str(self._folder), variable=process.PROFILE)
             self.install(name, program, text)
 
     def install(self, package: str, program: str, text: str) -> None:
@@ -87,7 +87,7 @@ class Launch:
             "PYTHONUNBUFFERED": "1",
             "ROS_LOG_DIR": str(self._folder / "log"),
         }
-        environment.pop(fast_dds.VARIABLE, None)
+        environment.pop(process.PROFILE, None)
         path = str(self._repository / "launch_scripts" / "recover.launch.py")
         self._process = subprocess.Popen(
             [sys.executable, "-c", SERVICE, path, *arguments],
@@ -178,7 +178,7 @@ def test_recover_is_wired_to_the_camera(launch: Launch, tmp_path: Path) -> None:
     assert parameters(words) == [
         str(mine), "model: supervised", "target_frame: map", "autostart: false", "use_sim_time: true",
     ]  # fmt: skip
-    assert noted["profile"] == str(fast_dds.profile_path())
+    assert noted["profile"] == str(process.profile_path())
     assert parameters(launch.note("fitter_node")["arguments"])[-1] == "method: classic"
     assert launch.end() == 0
     assert launch.left() == []

@@ -291,17 +291,16 @@ class TestLifecycle:
         assert withdrawn == ["deactivating"]
 
 class TestSwap:
-    def test_a_model_is_swapped_beside_the_work(self, make_bench):
+    def test_the_next_frame_has_the_model_that_was_set_last(self, make_bench):
         bench = make_bench().active()
         assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful
         assert bench.answer() == 1.0
         assert len(bench.made) == 1, "what does not concern the recoverer swaps nothing"
-        bench.gate.clear()
-        assert bench.node.set_parameters([Parameter("model", value="3")])[0].successful
-        assert bench.answer() == 1.0, "the old one goes on until the new one is ready"
-        bench.gate.set()
-        bench.until(lambda: bench.node._engine.description == "method auto, 3 on cpu")
+        for model in ("2", "4", "3"):
+            assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
         assert bench.answer() == 3.0
+        assert bench.node._engine.description == "method auto, 3 on cpu"
+        assert len(bench.made) == 2
         assert bench.made[-1].warm is not None
 
     def test_a_model_that_cannot_work_is_refused_or_leaves_the_old_one(self, make_bench):
@@ -310,24 +309,13 @@ class TestSwap:
         assert (refused.successful, refused.reason) == (False, "model: bad is no model")
         bench.fault = MemoryError("no room for weights")
         assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        assert bench.answer() == 1.0
         reason = "cannot change to method auto, 4 on cpu: no room for weights"
         bench.report(lambda one: one.level == DiagnosticStatus.WARN and one.message == reason)
-        assert bench.answer() == 1.0
         bench.fault = None
         assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
-        bench.until(lambda: bench.node._engine.description == "method auto, 4 on cpu")
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
-
-    def test_the_last_of_several_swaps_wins(self, make_bench):
-        bench = make_bench().active()
-        bench.gate.clear()
-        for model in ("2", "3", "4", "5"):
-            assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
-        bench.gate.set()
-        bench.until(lambda: bench.node._engine.description == "method auto, 5 on cpu")
-        assert bench.answer() == 5.0
-        assert len(bench.made) <= 3, "the first one, the one that was begun, and the last one"
 
     def test_a_model_that_is_set_while_another_one_is_loaded_follows_it(self, make_bench):
         bench = make_bench("-p", "autostart:=false")
@@ -336,7 +324,6 @@ class TestSwap:
         bench.until(lambda: bench.node.state == "configuring")
         assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.description == "method auto, 6 on cpu")
         assert bench.active().answer() == 6.0
 
 class TestSeveralCameras:
@@ -351,7 +338,6 @@ class TestSeveralCameras:
         for space in ("front", "wrist"):
             assert {one.header.frame_id for one in bench.answers[space]} == {f"{space}_camera"}
         assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
-        bench.until(lambda: bench.nodes[1]._engine.description == "method auto, 7 on cpu")
         assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0), "a swap leaves the other alone"
 
     def test_one_frame_at_a_time_and_nobody_starves(self, make_bench):

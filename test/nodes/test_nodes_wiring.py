@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import MessageError
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import fast_dds, frame_node
+from sq_perception.nodes import frame_node, process
 from sq_perception.nodes import input as input_module
 from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.statistics import WITHOUT_MASK
@@ -441,13 +442,12 @@ def test_lost_messages_are_counted_and_the_remedy_fits_the_subscription(make_ben
         deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         bench.peer.create_publisher(Image, "depth/image", deaf)
         bench.until(lambda: source._image.qos.reliability == QoSReliabilityPolicy.BEST_EFFORT)
-    source._image._on_lost(3, 3)
-    source._image._on_lost(5, 2)
-    source._info._on_lost(1, 1)
+    for listener, total, new in ((source._image, 3, 3), (source._image, 5, 2), (source._info, 1, 1)):
+        listener._on_message_lost(SimpleNamespace(total_count=total, total_count_change=new))
     assert bench.counts.lost == {"/depth/image": 5, "/depth/camera_info": 1}
     said = capfd.readouterr().err
     assert "3 messages of /depth/image lost" in said
-    assert said.count(f"FASTRTPS_DEFAULT_PROFILES_FILE={fast_dds.profile_path()}") == (0 if asked else 1)
+    assert said.count(f"FASTRTPS_DEFAULT_PROFILES_FILE={process.profile_path()}") == (0 if asked else 1)
     assert ("Raise the depth of the PUBLISHER" in said) == asked
 
 
