@@ -28,7 +28,7 @@ from common import (
 from running_nodes import Peer, arguments, environment, until, usage
 from started_nodes import Children
 
-from sq_perception.recordings import frame_source
+from sq_perception.nodes import synthetic_depth_node as frame_source
 
 NODE = "/recover_node"
 QUIET = ["--log-level", "warn"]

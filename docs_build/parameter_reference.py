@@ -2,7 +2,7 @@
 
     python docs_build/parameter_reference.py
 
-The dataclasses of :mod:`sq_perception.nodes.parameters` hold the defaults; a test compares the files with them.
+The dataclasses of the nodes hold the defaults; a test compares the files with them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,16 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from sq_perception.nodes.parameters import KINDS
+from sq_perception.nodes.grasp_node import GraspParameters
+from sq_perception.nodes.parameters import FitterParameters, Parameters, RecoverParameters
+from sq_perception.nodes.synthetic_depth_node import SyntheticParameters
+
+KINDS: dict[str, type[Parameters]] = {
+    "recover_node": RecoverParameters,
+    "fitter_node": FitterParameters,
+    "grasp_node": GraspParameters,
+    "synthetic_depth_node": SyntheticParameters,
+}
 
 
 def yaml_text(name: str) -> str:

@@ -3,7 +3,7 @@
 import numpy as np
 
 import sq_perception as sq
-from sq_perception.recordings.cloud_frame import CloudFrame
+from sq_perception.recordings.cloud_file import CloudFrame
 from sq_perception.recordings.frame_file import Reading
 from sq_perception.simulation.sample import sample
 

@@ -21,7 +21,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from sq_msgs_py.transforms import prefix_in
+from sq_msgs_py.poses import prefix_in
 from sq_perception.nodes import process
 
 ARGUMENTS = {

@@ -6,12 +6,15 @@
 Each superquadric has the columns of :class:`~sq_msgs_py.superquadrics.SuperquadricArray` by their names, each grasp
 those of :class:`~sq_msgs_py.grasps.GraspArray`, in its units and order; null where a number is not known.  Where the
 answer is no success, its message is the reason.
+
+Where the package sq_msgs is built, the same as its messages, whose fields are described there.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -19,10 +22,15 @@ import numpy as np
 
 from sq_msgs_py.columns import UINT32, MessageError
 from sq_msgs_py.grasps import GraspArray
+from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.poses import poses_at
 from sq_msgs_py.superquadrics import FIELDS, SuperquadricArray
 
-_NAMES: dict[type[Any], str] = {SuperquadricArray: "superquadrics", GraspArray: "grasps"}
-_SERVICES: dict[type[Any], str] = {SuperquadricArray: "~/recover", GraspArray: "~/plan"}
+_NAMES: dict[type[Any], tuple[str, str]] = {
+    SuperquadricArray: ("superquadrics", "~/recover"),
+    GraspArray: ("grasps", "~/plan"),
+}
+"""The key and the service of each kind of answer."""
 _WHOLE = tuple(name for name, kind in FIELDS if kind == UINT32)
 
 
@@ -47,14 +55,14 @@ class GraspAnswer:
 
 
 def text_of(found: SuperquadricArray | GraspArray, header: Any, summary: str) -> str:
-    """The message of an answer; ``header`` is that of the cloud."""
+    """Return the message of an answer; ``header`` is that of the cloud."""
     columns = {column.name: getattr(found, column.name) for column in fields(found)}
     return json.dumps(
         {
             "frame_id": header.frame_id,
             "stamp": {"sec": header.stamp.sec, "nanosec": header.stamp.nanosec},
             "summary": summary,
-            _NAMES[type(found)]: [
+            _NAMES[type(found)][0]: [
                 {name: _plain(column[k]) for name, column in columns.items()} for k in range(len(found))
             ],
         },
@@ -63,28 +71,25 @@ def text_of(found: SuperquadricArray | GraspArray, header: Any, summary: str) ->
 
 
 def from_response(response: Any) -> Answer:
-    """The answer of ``~/recover`` in a std_srvs/Trigger response.
+    """Return the answer of ``~/recover`` in a std_srvs/Trigger response.
 
-    Raises
-    ------
-    MessageError
-        If it was no success, with its reason, or is of another service.
+    Raises MessageError if it was no success, with its reason, or is of another service.
     """
     return Answer(*_parts(response, SuperquadricArray))
 
 
 def grasps_from_response(response: Any) -> GraspAnswer:
-    """The answer of ``~/plan``; raises as :func:`from_response` does."""
+    """Return the answer of ``~/plan``; raises as :func:`from_response` does."""
     return GraspAnswer(*_parts(response, GraspArray))
 
 
 def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
-    """Array, frame, stamp and summary of an answer."""
+    """Return array, frame, stamp and summary of an answer."""
     if not response.success:
         raise MessageError(response.message)
     try:
         found = json.loads(response.message)
-        rows, stamp = found[_NAMES[kind]], found["stamp"]
+        rows, stamp = found[_NAMES[kind][0]], found["stamp"]
         columns = {
             column.name: np.array([row[column.name] for row in rows], np.int64 if column.name in _WHOLE else float)
             for column in fields(kind)
@@ -93,15 +98,70 @@ def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
         nanoseconds = int(stamp["sec"]) * 10**9 + int(stamp["nanosec"])
         return kind(**columns), str(found["frame_id"]), nanoseconds, str(found["summary"])
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
-        raise MessageError(
-            f"expected the answer of a {_SERVICES[kind]} service: {type(error).__name__}: {error}"
-        ) from error
+        expected = f"expected the answer of a {_NAMES[kind][1]} service"
+        raise MessageError(f"{expected}: {type(error).__name__}: {error}") from error
 
 
 def _plain(value: np.ndarray | np.generic) -> Any:
-    """Numbers with as many digits as distinguish any two float32; JSON knows neither NaN nor infinity."""
+    """Return numbers with as many digits as distinguish any two float32; JSON knows neither NaN nor infinity."""
     if isinstance(value, np.ndarray):
         return [_plain(item) for item in value]
     if isinstance(value, np.integer):
         return int(value)
     return float(str(value)) if math.isfinite(value) else None
+
+
+_AS_THEY_ARE = ("id", "label", "status", "reason", "seen", "part", "score", "residual", "objectness")
+"""Columns that are fields of the same name."""
+
+
+def superquadric_array(
+    bodies: SuperquadricArray,
+    covariances: np.ndarray,
+    header: Any,
+    parts: SuperquadricArray,
+    types: MessageTypes = installed,
+) -> Any:
+    """Return the sq_msgs/SuperquadricArray of bodies (n,), covariances (n, 6, 6) of their poses, and their parts.
+
+    Raises ImportError where sq_msgs is not built.
+    """
+    return types("sq_msgs/msg/SuperquadricArray")(
+        header=header,
+        superquadrics=_superquadrics(bodies, covariances, types),
+        parts=_superquadrics(parts, np.full((len(parts), 6, 6), np.nan), types),
+    )
+
+
+def grasp_array(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> Any:
+    """Return the sq_msgs/GraspArray of grasps.  Raises ImportError as :func:`superquadric_array` does."""
+    kind = types("sq_msgs/msg/Grasp")
+    found = [
+        kind(pose=pose, **{name: getattr(grasps, name)[k].item() for name in ("id", "opening", "width", "score")})
+        for k, pose in enumerate(poses_at(grasps.position, grasps.rotation.astype(float), types))
+    ]
+    return types("sq_msgs/msg/GraspArray")(header=header, grasps=found)
+
+
+def _superquadrics(bodies: SuperquadricArray, covariances: np.ndarray, types: MessageTypes) -> list[Any]:
+    kind, posed, vector = (
+        types(name)
+        for name in ("sq_msgs/msg/Superquadric", "geometry_msgs/msg/PoseWithCovariance", "geometry_msgs/msg/Vector3")
+    )
+
+    def xyz(numbers: Sequence[float]) -> Any:
+        return vector(**dict(zip("xyz", numbers, strict=True)))
+
+    return [
+        kind(
+            pose=posed(pose=pose, covariance=covariances[k].ravel().tolist()),
+            half_size=xyz(bodies.size[k].tolist()),
+            sigma_half_size=xyz(bodies.sigma_size[k].tolist()),
+            exponents=bodies.shape[k].tolist(),
+            sigma_exponents=np.asarray(bodies.sigma_shape)[k].tolist(),
+            taper=bodies.taper[k].tolist(),
+            fused=bool(np.asarray(bodies.fused)[k]),
+            **{name: getattr(bodies, name)[k].item() for name in _AS_THEY_ARE},
+        )
+        for k, pose in enumerate(poses_at(bodies.translation, bodies.rotation.astype(float), types))
+    ]

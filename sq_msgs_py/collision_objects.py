@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from geometry_msgs.msg import Pose, Quaternion
 
-from sq_msgs_py.poses import matrices, pose_messages, unit_quaternions
+from sq_msgs_py.poses import PREFIX, body_name, matrices, pose_messages, unit_quaternions
 from sq_msgs_py.shapes import enclosing_factor, mesh_message, primitive, support
 from sq_msgs_py.superquadrics import SuperquadricArray
-from sq_msgs_py.transforms import PREFIX, name
 
 if TYPE_CHECKING:
     from moveit_msgs.msg import CollisionObject, PlanningScene
@@ -112,7 +111,7 @@ class Scene:
             self._send_again()
         self._known_as, self._header = known_as, header
         shown = superquadrics.recovered
-        names = [name(number, prefix) for number in shown.id]
+        names = [body_name(number, prefix) for number in shown.id]
         bodies = [self._known[key].body if key in self._known else None for key in names]
         new = np.array([_has_changed(body, shown, k) for k, body in enumerate(bodies)], dtype=bool)
         surfaces = None
@@ -120,7 +119,7 @@ class Scene:
             surfaces = list(compress(meshes(), new)) if new.any() else []
         objects = collision_objects(shown.where(new), header, meshes=surfaces, prefix=prefix)
         sent = dict(zip(np.flatnonzero(new), objects, strict=True))
-        unseen = {name(number, prefix) for number in hidden}
+        unseen = {body_name(number, prefix) for number in hidden}
         if self._is_new and rests:
             told = (self._known[key].message for key in sorted(unseen & self._known.keys()))
             objects += (message for message in told if message.header.frame_id == header.frame_id)
@@ -194,7 +193,8 @@ def collision_objects(
         raise ValueError(f"meshes: expected one for each of {len(bodies)} bodies, got {len(meshes)}")
     objects = []
     for k, pose in enumerate(pose_messages(bodies)):
-        added = CollisionObject(header=header, id=name(bodies.id[k], prefix), pose=pose, operation=CollisionObject.ADD)
+        name = body_name(bodies.id[k], prefix)
+        added = CollisionObject(header=header, id=name, pose=pose, operation=CollisionObject.ADD)
         here = Pose(orientation=Quaternion(w=1.0))
         if meshes is None:
             added.primitives, added.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]

@@ -1,4 +1,4 @@
-"""Arrays by columns in a sensor_msgs/PointCloud2: one point a row, one named field a number; of bodies, of grasps.
+"""Arrays by columns in a sensor_msgs/PointCloud2: one point a row, one named field a number; of bodies, grasps, points.
 
 Readers find fields by name, whatever their order, offset, type and byte order, and leave unknown ones aside.
 """
@@ -17,6 +17,7 @@ from sq_msgs_py.message_types import MessageTypes, installed
 if TYPE_CHECKING:
     from sensor_msgs.msg import PointCloud2
 
+
 _NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """By the datatypes of sensor_msgs/PointField."""
 UINT32, FLOAT32 = 6, 7
@@ -29,8 +30,8 @@ class MessageError(ValueError):
 
 
 def column(*names: str, is_finite: bool = False, missing: float = np.nan) -> Mapping[str, Any]:
-    """Metadata of a dataclass field: which fields of the message it holds, whether it has no NaN, and what stands for
-    numbers that are not given."""
+    """Return a dataclass field's metadata: its fields of the message, whether NaN is forbidden, and what stands for
+    missing numbers."""
     return {"names": names, "is_finite": is_finite, "missing": missing}
 
 
@@ -78,7 +79,7 @@ Rows = TypeVar("Rows", bound=Columns)
 
 
 def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> PointCloud2:
-    """The message of n rows (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
+    """Return the message of n rows (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
     layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in rows.FIELDS])
     points = np.zeros(len(rows), layout)
     for each in fields(rows):
@@ -104,12 +105,9 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> P
 
 
 def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) -> Rows:
-    """The rows of a message; columns whose fields are not all there, and not ``needed``, are left out.
+    """Return the rows of a message; columns whose fields are not all there, and not ``needed``, are left out.
 
-    Raises
-    ------
-    MessageError
-        As :func:`cloud_points`, or for columns that ``kind`` does not take.
+    Raises MessageError as :func:`cloud_points`, or for columns that ``kind`` does not take.
     """
     points = cloud_points(message, kind.FIELDS, needed)
     columns: dict[str, np.ndarray] = {}
@@ -125,7 +123,7 @@ def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) 
 
 
 def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str]) -> np.ndarray:
-    """The points (n,) of a cloud as a structured array of those of the described fields that are there.
+    """Return the points (n,) of a cloud as a structured array of those of the described fields that are there.
 
     Raises
     ------
@@ -167,3 +165,21 @@ def _check_unsigned(name: str, values: np.ndarray) -> None:
         raise ValueError(f"{name}: expected integers, got {values.dtype}")
     if values.size and (values.min() < 0 or values.max() > np.iinfo(np.uint32).max):
         raise ValueError(f"{name}: expected 0 to {np.iinfo(np.uint32).max}, got {values.min()} to {values.max()}")
+
+
+def points_from_message(message: PointCloud2) -> np.ndarray:
+    """Return points, float32 (height, width, 3), as they stand in a message: NaN or (0, 0, 0) for none, metres."""
+    found = cloud_points(message, [(name, FLOAT32) for name in "xyz"], "xyz")
+    with np.errstate(over="ignore"):  # doubles that no camera measures: infinite
+        points = np.stack([found[name].astype(np.float32) for name in "xyz"], axis=-1)
+    return points.reshape(int(message.height), int(message.width), 3)
+
+
+def labels_of_points(message: PointCloud2, fields: Sequence[str]) -> np.ndarray | None:
+    """Return labels (height, width) as they stand in the first of these fields that is there; None without one."""
+    present = {field.name for field in message.fields}
+    name = next((name for name in fields if name in present), None)
+    if name is None:
+        return None
+    found = cloud_points(message, [(name, UINT32)], [name])[name]
+    return found.reshape(int(message.height), int(message.width))

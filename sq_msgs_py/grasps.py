@@ -107,7 +107,7 @@ def moveit_grasps(
     up : (3,)
         Away from the table in the frame of the header, of length 1: the way of the retreat.  None: back as it came.
     prefix
-        Of the ids of collision objects, which the fingers may touch: :data:`sq_msgs_py.transforms.PREFIX`.
+        Of the ids of collision objects, which the fingers may touch: :data:`sq_msgs_py.poses.PREFIX`.
     joints
         Those of the fingers, each of which moves by half of the opening; none leaves both postures empty.
 

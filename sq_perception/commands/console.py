@@ -16,7 +16,7 @@ from sq_perception.files import output_file
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-    from sq_perception.recordings.cloud_frame import CloudFrame
+    from sq_perception.recordings.cloud_file import CloudFrame
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
@@ -215,7 +215,7 @@ def add_depth(command: argparse.ArgumentParser) -> None:
 
 
 def _cloud_frame(text: str) -> CloudFrame:
-    from sq_perception.recordings.cloud_frame import CloudFrame
+    from sq_perception.recordings.cloud_file import CloudFrame
 
     try:
         return CloudFrame.parse(text)

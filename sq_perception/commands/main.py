@@ -20,20 +20,20 @@ from sq_perception.files.version import __version__
 from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {
-    "sample": ("sample:main", "write a simulated depth image to begin with"),
+    "sample": ("rendering:sample", "write a simulated depth image to begin with"),
     "recover": ("recover:main", "depth images in, superquadrics out"),
     "fit": ("fit:main", "clouds or meshes of single objects in, superquadrics out"),
     "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
-    "render": ("render:main", "draw a superquadric as a depth image"),
+    "render": ("rendering:render", "draw a superquadric as a depth image"),
     "demo": ("demo:main", "a simulated camera and real ROS 2 nodes (extra 'ros')"),
-    "train": ("train:main", "train a network"),
-    "thing-views": ("shards:thing_views", "draw views of household things to train on"),
-    "train-things": ("shards:train_things", "train the network that predicts the unseen side of things"),
-    "segment-views": ("shards:segment_views", "draw segments of simulated scenes to train on"),
-    "train-masks": ("shards:train_masks", "train the network that finds outliers in segments"),
+    "train": ("training:train", "train a network"),
+    "thing-views": ("training:thing_views", "draw views of household things to train on"),
+    "train-things": ("training:train_things", "train the network that predicts the unseen side of things"),
+    "segment-views": ("training:segment_views", "draw segments of simulated scenes to train on"),
+    "train-masks": ("training:train_masks", "train the network that finds outliers in segments"),
     "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
-    "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
-    "warm-up": ("warm_up:main", "compile all kernels in advance"),
+    "doctor": ("installation:doctor", "versions, extras, kernels, cores, and what is missing"),
+    "warm-up": ("installation:warm_up", "compile all kernels in advance"),
 }
 """Name, module of this folder and its function, and summary."""
 

@@ -5,6 +5,7 @@ Nothing in a file is executed: no pickle, and YAML of plain data alone.
 
 from __future__ import annotations
 
+import glob
 import math
 import warnings
 from collections.abc import Iterable
@@ -31,7 +32,7 @@ def npz_arrays(path: Path, names: Iterable[str] | None = None) -> dict[str, np.n
     """Return the arrays of an NPZ archive that have these names, by name; all of them by default."""
     try:
         found = {}
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             sizes = {info.filename.removesuffix(".npy"): info.file_size for info in archive.zip.infolist()}
             for name in sizes if names is None else names:
                 if name in sizes:
@@ -123,7 +124,7 @@ class _PlainLoader(yaml.SafeLoader):
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
             raise UnpackingError("expected plain data, got an alias (*)")  # a few bytes of them unfold endlessly
-        return super().compose_node(parent, index)  # type: ignore[no-untyped-call]
+        return super().compose_node(parent, index)
 
 
 def yaml_documents(data: bytes) -> list[Any]:
@@ -148,3 +149,28 @@ def read_yaml(path: Path) -> Any:
     if len(documents) > 1:
         raise UnpackingError(f"expected one document, got {len(documents)}")
     return documents[0] if documents else None
+
+
+def label_image(folder: Path, name: str) -> np.ndarray:
+    """Read the instance masks of a frame as a label image, int32 (height, width), 0 for background.
+
+    | in the folder | labels |
+    | --- | --- |
+    | ``NAME.png``, grey | its values |
+    | ``NAME.png``, of a palette, as in PASCAL VOC and DAVIS | the indices of its colours |
+    | ``NAME_000000.png``, ``NAME_000001.png`` ..., as in BOP's ``mask_visib`` | 1, 2, ...: a binary image each |
+    """
+    path = folder / f"{name}.png"
+    if path.is_file():
+        return grey_image(path, of_indices=True).astype(np.int32)
+    found = folder.glob(f"{glob.escape(name)}_*.png")
+    paths = sorted(each for each in found if each.stem.rpartition("_")[2].isdigit())
+    if not paths:
+        raise UnpackingError("no such mask")
+    masks = [grey_image(each, of_indices=True) > 0 for each in paths]
+    if len({mask.shape for mask in masks}) > 1:
+        raise UnpackingError(f"expected masks of one size, got {sorted({mask.shape for mask in masks})}")
+    labels = np.zeros(masks[0].shape, np.int32)
+    for number, mask in enumerate(masks, 1):
+        labels[mask] = number
+    return labels

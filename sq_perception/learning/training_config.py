@@ -20,7 +20,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
-from sq_perception.files.unpacking import UnpackingError, read_yaml
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Framing
 
 if TYPE_CHECKING:
@@ -231,6 +230,8 @@ def shipped_names() -> list[str]:
 
 
 def _values(path: str | Path) -> dict[str, Any]:
+    from sq_perception.files.unpacking import UnpackingError, read_yaml  # NumPy, which --help needs not
+
     source = Path(path)
     if str(path) in shipped_names():
         source = _SHIPPED / f"{path}.yaml"

@@ -123,7 +123,7 @@ def create_node(name: str, namespace: str | None = None) -> process.Stoppable:
         from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
 
         return process.make(SyntheticDepthNode, name)
-    from sq_msgs_py.transforms import prefix_in
+    from sq_msgs_py.poses import prefix_in
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 

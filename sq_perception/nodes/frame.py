@@ -19,15 +19,15 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
+from sq_msgs_py.columns import labels_of_points, points_from_message
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message
-from sq_msgs_py.points import labels_of_points, points_from_message
 from sq_perception.geometry.rotation import to_matrix
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.parameters import POINTS, RAW
 from sq_perception.recordings import cloud_file, publication
-from sq_perception.recordings.cloud_frame import moved
+from sq_perception.recordings.cloud_file import move
 
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 MaskMessage: TypeAlias = Any
@@ -116,7 +116,7 @@ def decode(
         header, points = message.header, points_from_message(message) / np.float32(scale or 1.0)
         if view is not None:
             frame_id, (turn, shift) = view
-            header, points = Header(stamp=header.stamp, frame_id=frame_id), moved(points, to_matrix(turn), shift)
+            header, points = Header(stamp=header.stamp, frame_id=frame_id), move(points, to_matrix(turn), shift)
         try:
             labels = labels_of_points(message, cloud_file.LABEL_FIELDS)
             found = cloud_file.as_image(points, None if labels is None else cloud_file.labels_of(labels))

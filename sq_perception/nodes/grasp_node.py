@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import threading
 from contextlib import suppress
+from dataclasses import dataclass
 from time import monotonic
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -28,30 +29,69 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from sq_msgs_py import answers, transforms
+from sq_msgs_py import answers, poses
 from sq_msgs_py import grasps as messages
-from sq_msgs_py.interfaces import grasp_array
+from sq_msgs_py.answers import grasp_array
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import installed
-from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.grasping.gripper import Gripper, gripper
+from sq_perception.grasping.gripper import GRIPPERS, Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
-from sq_perception.grasping.planner import grasps, warm_up
+from sq_perception.grasping.planner import FRICTION, PLACEMENT, grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
-from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import ARRIVAL
-from sq_perception.nodes.parameters import GraspParameters
+from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, check_prefix, setting
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
 from sq_perception.recovery.recovery import timed
+from sq_perception.segmentation.options import Box
 
 _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
 """Columns of a message that are attributes of a grasp of the same name."""
+
+
+@dataclass(frozen=True)
+class GraspParameters(Parameters):
+    """Parameters of grasp_node."""
+
+    autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
+    max_age: float = setting(
+        10.0,
+        "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.",
+        unit="s",
+        within=(0.0, 3600.0),
+    )
+    no_cloud_warning: float = setting(
+        5.0, "Warn after this time without bodies; 0 never warns.", unit="s", within=(0.0, 3600.0)
+    )
+    tf_prefix: str = setting(poses.PREFIX, "The tf_prefix of recover_node, for the names that ~/plan_grasps uses.")
+    gripper: str = setting("panda", "Gripper to plan for.", choices=tuple(GRIPPERS))
+    friction: float = setting(FRICTION, "Smallest friction coefficient between pads and objects.", within=(0.05, 2.0))
+    placement: float = setting(
+        PLACEMENT, "Standard deviation of the hand's position along each axis, metres.", within=(0.0, 0.05)
+    )
+    min_score: float = setting(0.3, "Publish only grasps that hold with at least this probability.", within=(0.0, 1.0))
+    only_id: int = setting(-1, "Plan only for the body with this id; -1: for all.", within=(-1, 2**31 - 1))
+    region: tuple[float, ...] = setting(
+        EVERYWHERE,
+        "Plan for bodies with their centre in this box, min x, y, z, max x, y, z, in the cloud's frame; the default "
+        "keeps all.",
+        unit="m",
+    )
+
+    @property
+    def box(self) -> Box | None:
+        """``region``; None for the default, which keeps all, however far away the origin of a map is."""
+        return None if self.region == GraspParameters.region else cast(Box, self.region)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_box("region", self.region)
+        check_prefix(self.tf_prefix)
 
 
 class GraspNode(ManagedNode):
@@ -177,7 +217,7 @@ class GraspNode(ManagedNode):
             code.val = code.FAILURE
             return response
         settings = self._settings.current
-        known = [transforms.name(number, settings.tf_prefix) for number in from_message(cloud).recovered.id]
+        known = [poses.body_name(number, settings.tf_prefix) for number in from_message(cloud).recovered.id]
         if target and target not in known:
             code.val = code.INVALID_OBJECT_NAME
             code.message = f"target: expected an id among {', '.join(known) or 'none'}, got {target!r}"
@@ -203,7 +243,7 @@ class GraspNode(ManagedNode):
     def _plane_in(self, header: Any) -> np.ndarray | None:
         """Return the last plane if it is in the frame of this header."""
         plane = self._plane
-        return plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
+        return poses.plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
 
     def _answer(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
         """Plan and publish; return the grasps and why bodies have none.  No message ends the node."""
@@ -231,8 +271,8 @@ class GraspNode(ManagedNode):
             **{name: np.array([getattr(grasp, name) for grasp in plan.grasps]) for name in _OF_EACH_GRASP},
             id=np.array([bodies.id[grasp.body] for grasp in plan.grasps]),
         )
-        poses, details, shown = self._outputs
-        poses.publish(messages.poses(found, header))
+        arrows, details, shown = self._outputs
+        arrows.publish(messages.poses(found, header))
         details.publish(messages.to_message(found, header))
         if self._array is not None:
             self._array.publish(grasp_array(found, header))

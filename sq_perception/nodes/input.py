@@ -32,8 +32,7 @@ from sq_perception.nodes.frame import (
 )
 from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
-from sq_perception.nodes.live_parameters import LiveParameters
-from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
+from sq_perception.nodes.parameters import POINTS, RAW, LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
 from sq_perception.nodes.tracking import Pose
 from sq_perception.recordings.cloud_file import LABEL_FIELDS, UNORGANISED

@@ -9,7 +9,7 @@ from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
 
-from sq_msgs_py.interfaces import superquadric_array
+from sq_msgs_py.answers import superquadric_array
 from sq_msgs_py.message_types import installed
 from sq_perception.recordings.publication import Findings
 

@@ -31,13 +31,11 @@ from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import collision_objects
-from sq_msgs_py.detections import detections
-from sq_msgs_py.interfaces import superquadric_array
+from sq_msgs_py.answers import superquadric_array
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import installed
-from sq_msgs_py.poses import plane_message
+from sq_msgs_py.poses import detections, plane_message, transforms
 from sq_msgs_py.superquadrics import to_message
-from sq_msgs_py.transforms import transforms
 from sq_perception.nodes.frame import Frame, latched_qos
 from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.parameters import RecoverParameters

@@ -1,24 +1,176 @@
-"""The parameters of the nodes, one frozen dataclass per node, by :mod:`sq_perception.nodes.live_parameters`."""
+"""ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, updated at run time; and those
+of recover_node.
+
+Each field of such a dataclass is one parameter of the same name; :func:`setting` carries its descriptor:
+meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them
+and holds the current values; a worker that takes ``current`` once per frame sees a consistent set, and a change takes
+effect with the next frame.
+
+``ros2 param set /node s 3`` sends an INTEGER: where a float is declared, integers become doubles.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import Literal, cast, get_args
+from collections.abc import Callable, Mapping
+from dataclasses import Field, dataclass, field, fields, replace
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar, cast, get_args
 
-from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
 from sq_msgs_py.markers import ALPHA
-from sq_msgs_py.transforms import PREFIX
-from sq_perception.grasping.gripper import GRIPPERS
-from sq_perception.grasping.planner import FRICTION, PLACEMENT
+from sq_msgs_py.poses import PREFIX
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.imaging.depth_units import DepthKind
-from sq_perception.nodes.live_parameters import ParameterError, Parameters, setting
 from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.segmentation.options import Box, Pose
-from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
+
+
+class ParameterError(ValueError):
+    """Error that names an invalid parameter, what was expected and what arrived."""
+
+
+def setting(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    within: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = True,
+) -> Any:
+    """Return a dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
+    about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
+    return field(default=default, metadata=about)
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.
+
+    Raises ParameterError for a value that is none of the choices, or does not fit the others.
+    """
+
+    def __post_init__(self) -> None:
+        for parameter in fields(self):
+            choices, value = parameter.metadata["choices"], getattr(self, parameter.name)
+            if choices and value not in choices:
+                raise ParameterError(f"{parameter.name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+P = TypeVar("P", bound=Parameters)
+
+
+class LiveParameters(Generic[P]):
+    """Parameters of a node, declared from the fields of a dataclass ``kind``, with their changes.
+
+    Parameters
+    ----------
+    locked
+        Returns why parameters that are not live cannot change now; empty if they can.  None: they never can.
+    check
+        Raises ValueError for an invalid set of values; also gets the names of those that change.
+    changed
+        Called with the new values and the names of those that were set.
+    defaults
+        Of this node, in place of the dataclass'.
+
+    Raises
+    ------
+    InvalidParameterValueException, ParameterError
+        If a value given at the start has a wrong type, is out of range, or does not fit the others.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: type[P],
+        *,
+        locked: Callable[[], str] | None = None,
+        check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
+        changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
+        defaults: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        self._kinds: dict[str, Any] = {parameter.name: type(parameter.default) for parameter in fields(kind)}
+        self._fixed = {parameter.name for parameter in fields(kind) if not parameter.metadata["live"]}
+        self._locked, self._check, self._changed, self._defaults = locked, check, changed, defaults
+        self.current: P = kind(**self._values([self._declare(node, parameter) for parameter in fields(kind)]))
+        """The current values: an immutable set, replaced as a whole."""
+        node.add_pre_set_parameters_callback(lambda changes: [self._cast(change) for change in changes])
+        node.add_on_set_parameters_callback(self._on_set)
+        node.add_post_set_parameters_callback(self._accept)
+
+    def _declare(self, node: Node, parameter: Field[Any]) -> Parameter:
+        # Of any type at first: declared as a double it would refuse an integer given at the start.
+        default = self._defaults.get(parameter.name, parameter.default)
+        node.declare_parameter(parameter.name, default, ParameterDescriptor(dynamic_typing=True))
+        given = self._cast(node.get_parameter(parameter.name))
+        node.set_descriptor(parameter.name, describe(parameter, self._locked is None), given.get_parameter_value())
+        return given
+
+    def _cast(self, given: Parameter) -> Parameter:
+        """Return a parameter with integers as doubles where doubles, or a list of them, are declared."""
+        kind = self._kinds.get(given.name)
+        if kind is float and given.type_ == Parameter.Type.INTEGER:
+            return Parameter(given.name, value=float(given.value))
+        if kind is tuple and given.type_ == Parameter.Type.INTEGER_ARRAY:
+            return Parameter(given.name, value=[float(number) for number in given.value])
+        return given
+
+    def _values(self, changes: list[Parameter]) -> dict[str, Any]:
+        """Return the values by name, without rclpy's own parameters, which another thread may declare."""
+        return {change.name: self._kinds[change.name](change.value) for change in changes if change.name in self._kinds}
+
+    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+        values = self._values(changes)
+        try:
+            candidate = replace(self.current, **values)
+            # A value that stays as it is may always be set: `ros2 param load` sets all of a file.
+            fixed = sorted(self._fixed.intersection(values))
+            frozen = [name for name in fixed if getattr(candidate, name) != getattr(self.current, name)]
+            if frozen and self._locked is not None and (reason := self._locked()):
+                raise ParameterError(f"{', '.join(frozen)}: {reason}")
+            if values:
+                self._check(candidate, frozenset(values))
+        except (ValueError, OSError) as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _accept(self, changes: list[Parameter]) -> None:
+        if values := self._values(changes):
+            self.current = replace(self.current, **values)
+            self._changed(self.current, frozenset(values))
+
+
+def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
+    """Return the descriptor of a field: type, text with unit, range or choices.
+
+    It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
+    """
+    about = parameter.metadata
+    unit = about["unit"]
+    descriptor = ParameterDescriptor(
+        name=parameter.name,
+        type=Parameter.Type.from_parameter_value(parameter.default).value,
+        description=about["description"] + (f" [{unit}]" if unit else ""),
+        read_only=is_fixed and not about["live"],
+    )
+    if about["choices"]:
+        descriptor.additional_constraints = "one of: " + ", ".join(about["choices"])
+    elif about["within"] is not None:
+        low, high = about["within"]
+        descriptor.additional_constraints = f"{low:g} to {high:g} {unit}".rstrip()
+        if isinstance(parameter.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    return descriptor
+
 
 RAW, POINTS = "raw", "points"
 """Plain images, and clouds of points, as image_transport names them."""
@@ -27,7 +179,8 @@ _KEEPS_ALL = 100.0
 """Metres: the value of depth_max that keeps all readings."""
 
 
-def _check_box(name: str, box: tuple[float, ...]) -> None:
+def check_box(name: str, box: tuple[float, ...]) -> None:
+    """Raise ParameterError for numbers that are no box."""
     if len(box) != 6 or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
         raise ParameterError(f"{name}: expected least x, y, z and greater x, y, z in metres, got {list(box)}")
 
@@ -39,8 +192,8 @@ def _check_frame(name: str, frame: str) -> None:
         )
 
 
-def _check_prefix(prefix: str) -> None:
-    """Check that the prefix makes valid names: 7 alone is none for a tf2 frame or a collision object."""
+def check_prefix(prefix: str) -> None:
+    """Raise ParameterError if the prefix makes no valid names: 7 alone is none for a frame or a collision object."""
     _check_frame("tf_prefix", prefix)
     if not prefix:
         raise ParameterError(f"tf_prefix: expected something before the ids, such as {PREFIX}, got nothing")
@@ -208,7 +361,7 @@ class RecoverParameters(Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_box("workspace", self.workspace)
+        check_box("workspace", self.workspace)
         if not self.depth_min < self.depth_max:
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
@@ -224,7 +377,7 @@ class RecoverParameters(Parameters):
             _check_frame(name, getattr(self, name))
         if self.camera_frame and self.image_transport != POINTS:
             raise ParameterError(f"camera_frame: expected image_transport = {POINTS}, got {self.image_transport}")
-        _check_prefix(self.tf_prefix)
+        check_prefix(self.tf_prefix)
 
 
 @dataclass(frozen=True)
@@ -232,129 +385,3 @@ class FitterParameters(RecoverParameters):
     """Parameters of fitter_node: those of recover_node with another method."""
 
     method: Method = field(default="classic", metadata=RecoverParameters.__dataclass_fields__["method"].metadata)
-
-
-@dataclass(frozen=True)
-class SyntheticParameters(Parameters):
-    """Parameters of synthetic_depth_node."""
-
-    scene: Literal["thesis", "table", "replay"] = setting(
-        "table",
-        "thesis: orthographic grey images of one random body; table: a pinhole camera over bodies on a table; replay: "
-        "recorded frames from path.",
-        choices=("thesis", "table", "replay"),
-        live=False,
-    )
-    rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0))
-    seed: int = setting(
-        0, "Seed of scenes and noise: equal seeds give equal images.", within=(0, 2**31 - 1), live=False
-    )
-    noise: float = setting(
-        0.0,
-        "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
-        unit="m or grey levels",
-        within=(0.0, 50.0),
-    )
-    sensor: str = setting(
-        IDEAL,
-        "Simulated sensor: ideal adds only noise; the others have their own noise, steps, edges and holes "
-        "(docs/sensors.md).",
-        choices=(IDEAL, *PRESETS),
-    )
-    hold: int = setting(30, "Frames per scene or recording; the noise changes.", within=(1, 10**6), live=False)
-    scenes: int = setting(0, "Number of scenes before it stops or repeats; 0: endless.", within=(0, 10**6), live=False)
-    loop: bool = setting(True, "Start again after the last scene or recording; false: stop publishing.", live=False)
-    objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
-    encoding: str = setting(
-        "auto",
-        "auto: mono8 for orthographic frames, 32FC1 for others.",
-        choices=("auto", *GREY_ENCODINGS, *DEPTH_ENCODINGS),
-        live=False,
-    )
-    masks: str = setting(
-        "auto",
-        "Label images on mask/image: auto publishes those of recordings, always also those of generated scenes.",
-        choices=("auto", "always", "never"),
-        live=False,
-    )
-    frame_id: str = setting(
-        "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames.", live=False
-    )
-    path: str = setting("", "A recorded frame or a folder of them, for scene = replay.", live=False)
-    camera_info_file: str = setting(
-        "",
-        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, without distortion.",
-        live=False,
-    )
-    projection: Projection = setting(
-        "pinhole",
-        "Camera model of recorded images, since 8 bit orthographic images look like depth images.",
-        choices=get_args(Projection),
-        live=False,
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.scene != "replay":
-            self.check(self.scene == "thesis", f"scene = {self.scene}")
-        elif not self.path:
-            raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
-        if self.sensor != IDEAL and self.noise != 0:
-            raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
-
-    def check(self, is_cube: bool, what: str) -> None:
-        """Raise ParameterError if ``what`` has images of the unit cube and these parameters do not, or the reverse."""
-        if self.encoding != "auto" and is_cube != (self.encoding in GREY_ENCODINGS):
-            expected = " or ".join(GREY_ENCODINGS if is_cube else DEPTH_ENCODINGS)
-            raise ParameterError(f"encoding: expected {expected} for {what}, got {self.encoding}")
-        if is_cube and self.sensor != IDEAL:
-            raise ParameterError(f"sensor: expected {IDEAL} for {what}, got {self.sensor}")
-
-
-@dataclass(frozen=True)
-class GraspParameters(Parameters):
-    """Parameters of grasp_node."""
-
-    autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
-    max_age: float = setting(
-        10.0,
-        "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.",
-        unit="s",
-        within=(0.0, 3600.0),
-    )
-    no_cloud_warning: float = setting(
-        5.0, "Warn after this time without bodies; 0 never warns.", unit="s", within=(0.0, 3600.0)
-    )
-    tf_prefix: str = setting(PREFIX, "The tf_prefix of recover_node, for the names that ~/plan_grasps uses.")
-    gripper: str = setting("panda", "Gripper to plan for.", choices=tuple(GRIPPERS))
-    friction: float = setting(FRICTION, "Smallest friction coefficient between pads and objects.", within=(0.05, 2.0))
-    placement: float = setting(
-        PLACEMENT, "Standard deviation of the hand's position along each axis, metres.", within=(0.0, 0.05)
-    )
-    min_score: float = setting(0.3, "Publish only grasps that hold with at least this probability.", within=(0.0, 1.0))
-    only_id: int = setting(-1, "Plan only for the body with this id; -1: for all.", within=(-1, 2**31 - 1))
-    region: tuple[float, ...] = setting(
-        EVERYWHERE,
-        "Plan for bodies with their centre in this box, min x, y, z, max x, y, z, in the cloud's frame; the default "
-        "keeps all.",
-        unit="m",
-    )
-
-    @property
-    def box(self) -> Box | None:
-        """``region``; None for the default, which keeps all, however far away the origin of a map is."""
-        return None if self.region == GraspParameters.region else cast(Box, self.region)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_box("region", self.region)
-        _check_prefix(self.tf_prefix)
-
-
-KINDS: dict[str, type[Parameters]] = {
-    "recover_node": RecoverParameters,
-    "fitter_node": FitterParameters,
-    "grasp_node": GraspParameters,
-    "synthetic_depth_node": SyntheticParameters,
-}
-"""The parameters of each node."""

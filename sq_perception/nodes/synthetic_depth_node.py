@@ -9,12 +9,16 @@
 
 All have the same stamp and frame.  Publishers are reliable, so best effort subscribers receive them too.  The image is
 published last: whoever has it has the rest.
+
+:class:`FrameSource` holds each image for some frames, in which only the noise changes, and goes on to the next.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from rclpy.node import Node
@@ -22,26 +26,191 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
-from sq_msgs_py.depth_image import GREY_ENCODINGS, intrinsics_to_message, labels_to_message
+from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, intrinsics_to_message, labels_to_message
 from sq_msgs_py.superquadrics import to_message
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import intrinsics
-from sq_perception.nodes.live_parameters import LiveParameters
-from sq_perception.nodes.parameters import SyntheticParameters
+from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.nodes.parameters import LiveParameters, ParameterError, Parameters, setting
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings import camera_file, inputs
-from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generate, read, recordings
+from sq_perception.recordings import bag_file, camera_file, frame_file, inputs
+from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
-from sq_perception.simulation.scenes import TABLE_CAMERA
+from sq_perception.simulation.scenes import TABLE_CAMERA, table_scene, thesis_scene
+from sq_perception.simulation.sensor_noise import IDEAL, PRESETS, Ideal, preset
+
+
+@dataclass(frozen=True)
+class SyntheticParameters(Parameters):
+    """Parameters of synthetic_depth_node."""
+
+    scene: Literal["thesis", "table", "replay"] = setting(
+        "table",
+        "thesis: orthographic grey images of one random body; table: a pinhole camera over bodies on a table; replay: "
+        "recorded frames from path.",
+        choices=("thesis", "table", "replay"),
+        live=False,
+    )
+    rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0))
+    seed: int = setting(
+        0, "Seed of scenes and noise: equal seeds give equal images.", within=(0, 2**31 - 1), live=False
+    )
+    noise: float = setting(
+        0.0,
+        "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
+        unit="m or grey levels",
+        within=(0.0, 50.0),
+    )
+    sensor: str = setting(
+        IDEAL,
+        "Simulated sensor: ideal adds only noise; the others have their own noise, steps, edges and holes "
+        "(docs/sensors.md).",
+        choices=(IDEAL, *PRESETS),
+    )
+    hold: int = setting(30, "Frames per scene or recording; the noise changes.", within=(1, 10**6), live=False)
+    scenes: int = setting(0, "Number of scenes before it stops or repeats; 0: endless.", within=(0, 10**6), live=False)
+    loop: bool = setting(True, "Start again after the last scene or recording; false: stop publishing.", live=False)
+    objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
+    encoding: str = setting(
+        "auto",
+        "auto: mono8 for orthographic frames, 32FC1 for others.",
+        choices=("auto", *GREY_ENCODINGS, *DEPTH_ENCODINGS),
+        live=False,
+    )
+    masks: str = setting(
+        "auto",
+        "Label images on mask/image: auto publishes those of recordings, always also those of generated scenes.",
+        choices=("auto", "always", "never"),
+        live=False,
+    )
+    frame_id: str = setting(
+        "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames.", live=False
+    )
+    path: str = setting("", "A recorded frame or a folder of them, for scene = replay.", live=False)
+    camera_info_file: str = setting(
+        "",
+        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, without distortion.",
+        live=False,
+    )
+    projection: Projection = setting(
+        "pinhole",
+        "Camera model of recorded images, since 8 bit orthographic images look like depth images.",
+        choices=get_args(Projection),
+        live=False,
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.scene != "replay":
+            self.check(self.scene == "thesis", f"scene = {self.scene}")
+        elif not self.path:
+            raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
+        if self.sensor != IDEAL and self.noise != 0:
+            raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
+
+    def check(self, is_cube: bool, what: str) -> None:
+        """Raise ParameterError if ``what`` has images of the unit cube and these parameters do not, or the reverse."""
+        if self.encoding != "auto" and is_cube != (self.encoding in GREY_ENCODINGS):
+            expected = " or ".join(GREY_ENCODINGS if is_cube else DEPTH_ENCODINGS)
+            raise ParameterError(f"encoding: expected {expected} for {what}, got {self.encoding}")
+        if is_cube and self.sensor != IDEAL:
+            raise ParameterError(f"sensor: expected {IDEAL} for {what}, got {self.sensor}")
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFrame(RecordedFrame):
+    """One image; ``truth`` (n,) are its bodies in the frame that results are published in, if they are known."""
+
+    truth: Superquadric | None = None
+
+
+Maker = Callable[[int], SourceFrame]
+"""Makes the k-th image without noise, the same one for each call."""
+
+
+class FrameSource:
+    """Frames in their order: each of ``count`` images (0: endless) for ``hold`` frames, in a ``loop`` or once.
+
+    Raises ValueError if the first image cannot be read or made.
+    """
+
+    def __init__(self, make: Maker, count: int, *, seed: int, hold: int, loop: bool) -> None:
+        self._make, self._count, self._hold, self._loop = make, count, hold, loop
+        self._noise = np.random.default_rng([seed, 2])
+        self._position, self._left = 0, hold
+        self.clean = make(0)
+        """The current image without noise."""
+
+    def next(self, noise: float, sensor: str = IDEAL) -> SourceFrame | None:
+        """Return the next image as the sensor measures it; None after the last one.
+
+        ``noise`` is that of the ideal sensor, metres, or grey levels of 255 for the unit cube.  Raises ValueError if a
+        recording cannot be read (the one after it is next), or the sensor cannot have taken the image.
+        """
+        if self._left == 0:
+            self._position += 1
+            if self._count and self._position >= self._count:
+                if not self._loop:
+                    self._position = self._count
+                    return None
+                self._position = 0
+            self.clean = self._make(self._position)
+            self._left = self._hold
+        self._left -= 1
+        model = Ideal(noise / 255 if self.clean.is_cube else noise) if sensor == IDEAL else preset(sensor)
+        return replace(self.clean, depth=model.measured(self.clean.depth, self.clean.camera, self._noise))
+
+
+def generate(
+    scene: Literal["thesis", "table"],
+    seed: int,
+    *,
+    objects: int,
+    camera: Camera = TABLE_CAMERA,
+    with_labels: bool = False,
+) -> Maker:
+    """Return a maker of random scenes: a thesis' image, or ``objects`` on a table before a ``camera``."""
+
+    def make(position: int) -> SourceFrame:
+        rng = np.random.default_rng([seed, 1, position])
+        is_thesis = scene == "thesis"
+        made = thesis_scene(rng) if is_thesis else table_scene(rng, objects, camera)
+        depth, labels = made.render()
+        truth = unit_cube.cube_from_optical(made.bodies) if is_thesis else made.bodies
+        return SourceFrame(
+            depth, made.camera, labels if with_labels else None, f"{scene} scene {position}", truth=truth
+        )
+
+    return make
+
+
+def read(
+    paths: Sequence[Path], camera_info: Path | str | None, projection: Projection, *, with_labels: bool
+) -> Maker:
+    """Return a maker of recorded frames."""
+
+    def make(position: int) -> SourceFrame:
+        frame = frame_file.read(paths[position], camera_info, projection)
+        return SourceFrame(frame.depth, frame.camera, frame.labels if with_labels else None, frame.name)
+
+    return make
+
+
+def recordings(path: Path) -> list[Path]:
+    """Return a recorded frame, or those of a folder in their order; ValueError if there is none."""
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise ValueError(f"path: expected a recorded frame or a folder of them, {path} does not exist")
+    found = [frame for frame in inputs.in_folder(path) if not bag_file.is_bag(frame)]
+    if not found:
+        raise ValueError(f"path: expected recorded frames ({', '.join(frame_file.SUFFIXES)}) in {path}, there are none")
+    return found
 
 
 def frame_source(parameters: SyntheticParameters) -> FrameSource:
-    """Return the images that the parameters ask for.
-
-    Raises
-    ------
-    ValueError
-        If there is nothing to replay, or the first image cannot be read, made, or published as they want it.
-    """
+    """Return the images that the parameters ask for; ValueError if the first one cannot be had or published so."""
     info = parameters.camera_info_file
     if parameters.scene == "replay":
         if info:
@@ -64,13 +233,7 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
 
 
 class SyntheticDepthNode(Node):
-    """Node that publishes one frame per tick of its timer.
-
-    Raises
-    ------
-    ValueError
-        If the parameters do not fit together or the first frame cannot be read or made.
-    """
+    """Node that publishes one frame per tick of its timer; ValueError as :func:`frame_source`."""
 
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context=context)

@@ -5,6 +5,7 @@ themselves, as u = fx x / z + cx.  Any other cloud is looked at from the origin:
 Nothing is then known of the space beside an object (``RecordedFrame.has_free_space``), as points of several views, or
 thinned ones, leave gaps through which one sees what is behind.  Points far off the axis are left out.  A field
 ``instance`` or ``label`` of the points holds the objects that they belong to, 0 for none: the masks of the image.
+:class:`CloudFrame` is the camera of a cloud in another frame: z up, as of a robot or a table, or y up, as of graphics.
 
 References: PCD, https://pointclouds.org/documentation/tutorials/pcd_file_format.html; LZF, which packs it, is
 http://oldhome.schmorp.de/marc/liblzf.html; trimesh reads PLY.
@@ -12,14 +13,17 @@ http://oldhome.schmorp.de/marc/liblzf.html; trimesh reads PLY.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError, npy_array, npz_arrays
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
+from sq_perception.tracking.state import parse_pose
 
 SUFFIXES = (".pcd", ".ply")
 LABEL_FIELDS = ("instance", "label")
@@ -32,30 +36,6 @@ UNORGANISED = (
     "known of the space beside an object, so that the side that is not seen is less sure; a depth image or an "
     "organised cloud shows more"
 )
-_NUMBERS = {"F": "f", "I": "i", "U": "u"}
-_PIXEL_ERROR = 0.1
-"""Between the place of a point in an organised cloud and in the image of its camera."""
-_ON_PIXELS = 0.99
-"""Least share of coordinates of an organised cloud with a smaller error."""
-_FITTED = 20000
-"""About so many points of an organised cloud determine its camera, in a third of the time of all of a VGA image's."""
-_LEAST_POINTS = 100
-_POINTS_A_PIXEL = 2.0
-"""Points of a cloud that is no image for each pixel, so that few pixels of a surface stay empty."""
-_LARGEST_SIDE = 1024
-_WIDEST = 1.75
-"""|x / z| and |y / z| of points: 60 degrees off the axis, the edge of the widest images of depth cameras.  Clouds of
-several views have some below or beside the camera, and one of them is enough to leave no pixels for all others."""
-_MOST_UNSEEN = 1 / 3
-"""Share of the points that are behind the camera or off its axis; more are those of another frame."""
-_LAYER, _MOST_LAYERED = 0.01, 0.5
-"""How far points stray from the plane through their neighbours in the image, as a share of their depth, where they are
-of two layers, a front and a back; and the largest share of such points in the cloud of one camera.  Seven to nine in
-ten of an object's from all sides, one in five of a sparse one of a crowded table from one."""
-_AROUND, _LAYER_SAMPLE = 16, 500
-"""Neighbours in the image of each of so many points."""
-_NEIGHBOURS = 2000
-"""Points whose nearest neighbour gives the density of the cloud."""
 
 
 class Cloud(NamedTuple):
@@ -75,15 +55,8 @@ class CloudImage(NamedTuple):
 
 
 def read_cloud(path: Path) -> Cloud:
-    """The points and labels of a PCD, a PLY, or an NPZ of ``points`` and ``labels``.
-
-    Raises
-    ------
-    UnpackingError
-        If the file is no readable cloud.
-    """
-    if path.stat().st_size > MOST_BYTES:
-        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    """Read a PCD, a PLY, or an NPZ of ``points`` and ``labels``."""
+    _check_size(path)
     reader = {".pcd": _pcd, ".npz": _npz}.get(path.suffix.lower(), _ply)
     try:
         points, labels = reader(path)
@@ -95,13 +68,7 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def labels_of(numbers: np.ndarray) -> np.ndarray:
-    """Labels as int32, 0 for what is none: negative, or NaN.
-
-    Raises
-    ------
-    UnpackingError
-        If they are no whole numbers below 2^31.
-    """
+    """Return labels as int32, 0 for what is none: negative, or NaN."""
     found = np.nan_to_num(numbers.astype(float), nan=0.0, posinf=np.inf, neginf=0.0).clip(0)
     if found.size and (found.max() > np.iinfo(np.int32).max or (found != np.rint(found)).any()):
         raise UnpackingError(f"labels: expected whole numbers below 2^31, got {found.max():g}")
@@ -109,13 +76,7 @@ def labels_of(numbers: np.ndarray) -> np.ndarray:
 
 
 def read_surface(path: Path) -> Any:
-    """Points (n, 3) of a cloud, or the mesh of a file that has faces: ``vertices`` and ``faces``.
-
-    Raises
-    ------
-    UnpackingError
-        If the file is neither.
-    """
+    """Return points (n, 3) of a cloud, or the mesh of a file that has faces: ``vertices`` and ``faces``."""
     suffix = path.suffix.lower()
     if suffix == ".npy":
         array = npy_array(path)
@@ -128,8 +89,7 @@ def read_surface(path: Path) -> Any:
         raise UnpackingError(f"expected a name that ends in .pcd, .npy, {', '.join(MESH_SUFFIXES)}")
     import trimesh
 
-    if path.stat().st_size > MOST_BYTES:
-        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    _check_size(path)
     try:
         found: Any = trimesh.load(path, file_type=suffix[1:], process=False, skip_materials=True)
         found = found.to_geometry() if isinstance(found, trimesh.Scene) else found
@@ -140,45 +100,50 @@ def read_surface(path: Path) -> Any:
         raise UnpackingError(f"not a readable cloud or mesh: {type(error).__name__}: {error}") from error
 
 
-def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage:
-    """The image of points (height, width, 3) and their labels (height, width).
+def _check_size(path: Path) -> None:
+    if path.stat().st_size > MOST_BYTES:
+        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
 
-    Raises
-    ------
-    UnpackingError
-        If they do not lie before a camera in the origin that looks along z.
+
+def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage:
+    """Return the image of points (height, width, 3) and their labels (height, width).
+
+    Raises UnpackingError if they do not lie before a camera in the origin that looks along z.
     """
+    least = 100
     with np.errstate(invalid="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
         before = there & (points[..., 2] > LEAST_DEPTH) & (points[..., 2] < GREATEST_DEPTH)
     count = int(np.count_nonzero(there))
     with np.errstate(all="ignore"):
-        near = before & (np.abs(points[..., :2]).max(axis=2) < _WIDEST * points[..., 2])
+        # 60 degrees off the axis, the edge of the widest images: one point beside the camera, as in clouds of several
+        # views, would leave no pixels for all others.
+        near = before & (np.abs(points[..., :2]).max(axis=2) < 1.75 * points[..., 2])
     behind, off = (float(np.count_nonzero(some)) / max(count, 1) for some in (there & ~before, before & ~near))
     expected = (
-        f"expected {_LEAST_POINTS} points or more, most of them before the camera: x right, y down, z forward from it; "
+        f"expected {least} points or more, most of them before the camera: x right, y down, z forward from it; "
         f"of {count} points {behind:.0%} are behind it and {off:.0%} more than 60 degrees off its axis. A cloud in the "
         "frame of a robot, a table or a map (z up) needs --frame (of a node: camera_frame); "
         "clouds of whole objects are for sq-perception fit"
     )
     if behind > 0.5:
         expected += " (of clouds with z backward, as graphics has it, negate z, and y where it is up)"
-    if np.count_nonzero(before) < _LEAST_POINTS or behind > 0.5:
+    if np.count_nonzero(before) < least or behind > 0.5:
         raise UnpackingError(expected)
     if points.shape[0] > 1:
-        v, u = (index[:: 1 + np.count_nonzero(before) // _FITTED] for index in np.nonzero(before))
+        v, u = (index[:: 1 + np.count_nonzero(before) // 20000] for index in np.nonzero(before))
         x, y, z = points[v, u].astype(float).T
         tangents = np.stack([x / z, y / z], axis=1)
         (fx, cx), (fy, cy) = _line(tangents[:, 0], u), _line(tangents[:, 1], v)
         error = np.abs(tangents * [fx, fy] + [cx, cy] - np.stack([u, v], axis=1))
-        if min(fx, fy) > 0 and np.count_nonzero(error < _PIXEL_ERROR) > _ON_PIXELS * error.size:
+        if min(fx, fy) > 0 and np.count_nonzero(error < 0.1) > 0.99 * error.size:
             depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
             return CloudImage(depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), labels, True)
-    if np.count_nonzero(near) < max(_LEAST_POINTS, (1 - _MOST_UNSEEN) * count):
+    if np.count_nonzero(near) < max(least, 2 / 3 * count):
         raise UnpackingError(expected)
     x, y, z = points[near].astype(float).T
     tangents = np.stack([x / z, y / z], axis=1)
-    if (layered := _is_layered(tangents, z)) > _MOST_LAYERED:
+    if (layered := _layered_share(tangents, z)) > 0.5:
         raise UnpackingError(
             f"{layered:.0%} of the points lie before or behind others, as in the cloud of a whole object and not in "
             "that of one camera: sq-perception fit takes clouds of whole objects"
@@ -186,24 +151,27 @@ def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage
     return _seen(tangents, z, None if labels is None else labels[near])
 
 
-def _is_layered(tangents: np.ndarray, z: np.ndarray) -> float:
-    """The share of points whose neighbours in the image lie on no common plane: those of a front and a back."""
+def _layered_share(tangents: np.ndarray, z: np.ndarray) -> float:
+    """Return the share of points whose neighbours in the image lie on no common plane: those of a front and a back.
+
+    Seven to nine in ten of an object's from all sides, one in five of a sparse one of a crowded table from one.
+    """
     from scipy.spatial import cKDTree
 
-    some = np.linspace(0, len(z) - 1, min(_LAYER_SAMPLE, len(z))).astype(int)
-    near = cKDTree(tangents).query(tangents[some], k=_AROUND)[1]
+    some = np.linspace(0, len(z) - 1, min(500, len(z))).astype(int)
+    near = cKDTree(tangents).query(tangents[some], k=16)[1]
     offset = tangents[near] - tangents[some][:, None]
     offset /= np.maximum(np.abs(offset).max(axis=(1, 2), keepdims=True), 1e-12)
-    rows = np.concatenate([offset, np.ones((len(some), _AROUND, 1))], axis=2)
+    rows = np.concatenate([offset, np.ones((*offset.shape[:2], 1))], axis=2)
     depth = z[near] / z[some][:, None]
     transposed = np.swapaxes(rows, 1, 2)
     plane = np.linalg.solve(transposed @ rows + 1e-9 * np.eye(3), transposed @ depth[..., None])
     off = np.abs(depth - (rows @ plane)[..., 0])
-    return float(np.mean(np.median(off, axis=1) > _LAYER))
+    return float(np.mean(np.median(off, axis=1) > 0.01))
 
 
 def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:
-    """f and c of the line pixel = f tangent + c with the least squares; (0, 0) where all tangents are one."""
+    """Return f and c of the line pixel = f tangent + c with the least squares; (0, 0) where all tangents are one."""
     middle = tangents.mean()
     spread = tangents - middle
     square = spread @ spread
@@ -212,14 +180,14 @@ def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:
 
 
 def _seen(tangents: np.ndarray, z: np.ndarray, labels: np.ndarray | None) -> CloudImage:
-    """The nearest point in each pixel of a camera that is as fine as the points."""
+    """Return the nearest point in each pixel of a camera that is as fine as the points."""
     from scipy.spatial import cKDTree
 
-    some = tangents[:: max(1, len(tangents) // _NEIGHBOURS)]
+    some = tangents[:: max(1, len(tangents) // 2000)]
     spacing = float(np.median(cKDTree(tangents).query(some, k=2)[0][:, 1]))
     low, high = tangents.min(axis=0), tangents.max(axis=0)
-    finest = float((high - low).max()) / (_LARGEST_SIDE - 2)
-    pixel = max(spacing * np.sqrt(_POINTS_A_PIXEL), finest, 1e-9)
+    finest = float((high - low).max()) / 1022
+    pixel = max(spacing * np.sqrt(2.0), finest, 1e-9)  # two points a pixel: few of a surface stay empty
     width, height = (int(side) + 2 for side in np.ceil((high - low) / pixel))
     column, row = np.rint((tangents - low) / pixel).astype(int).T
     order = np.argsort(-z, kind="stable")  # of what is assigned to one pixel the last counts
@@ -271,7 +239,7 @@ def _pcd(path: Path) -> _Parts:
     if not (0 < count <= MOST_PIXELS and width > 0):
         raise UnpackingError(f"expected 1 to {MOST_PIXELS} points, got {width} x {height}")
     counts = [int(part) for part in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
-    kinds = [f"<{_NUMBERS[kind]}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
+    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
     field = next((name for name in LABEL_FIELDS if name in head["FIELDS"]), None)
     where = [head["FIELDS"].index(name) for name in ("x", "y", "z", *([field] if field else []))]
 
@@ -302,7 +270,7 @@ def _pcd(path: Path) -> _Parts:
 
 @kernel
 def _unpack(packed: np.ndarray, out: np.ndarray) -> bool:
-    """Whether LZF's bytes unpack to just as many as ``out`` holds: runs of literals, and copies of what came before."""
+    """Unpack LZF: runs of literals, and copies of what came before; False if it is not just what ``out`` holds."""
     i, n, to = 0, len(packed), 0
     while i < n:
         control = int(packed[i])
@@ -332,3 +300,64 @@ def _unpack(packed: np.ndarray, out: np.ndarray) -> bool:
                 out[to + k] = out[start + k]
         to += length
     return to == len(out)
+
+
+@dataclass(frozen=True)
+class CloudFrame:
+    """Where the camera is in the frame of a cloud: its place, and its rotation where that is known.
+
+    With R, t the pose of its optical frame in the cloud's frame, p_optical = R^T (p - t), metres.
+    """
+
+    place: tuple[float, ...]
+    quaternion: tuple[float, ...] | None
+
+    @classmethod
+    def parse(cls, text: str) -> CloudFrame:
+        """Return the frame that a user names; ValueError for anything else."""
+        # Of the optical frame in frames with the same origin: x forward, z up; and y up, z backward.
+        axes = {"link": (0.5, -0.5, 0.5, -0.5), "graphics": (1.0, 0.0, 0.0, 0.0)}
+        if text in axes:
+            return cls((0.0, 0.0, 0.0), axes[text])
+        try:
+            numbers = [float(part) for part in text.split(",")]
+            if len(numbers) not in (3, 7):
+                raise ValueError
+            turn, place = parse_pose((numbers[3:] or [0.0, 0.0, 0.0, 1.0], numbers[:3]))
+        except ValueError:
+            raise ValueError(
+                "expected where the camera stood in the frame of the cloud, X,Y,Z (it looks at the middle of the "
+                "points) or X,Y,Z,QX,QY,QZ,QW (its optical frame), or the axes of a cloud around the camera: link "
+                f"(x forward, z up) or graphics (y up, z backward); got {text!r}"
+            ) from None
+        return cls(tuple(place.tolist()), tuple(turn.tolist()) if len(numbers) == 7 else None)
+
+    def pose(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return R (3, 3) and t (3,) of the camera before these points (..., 3)."""
+        place = np.array(self.place)
+        if self.quaternion is not None:
+            return quaternions.to_matrix(np.array(self.quaternion)), place
+        forward = np.median(points[np.isfinite(points).all(axis=-1)], axis=0) - place
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        if np.linalg.norm(right) < 1e-6 * np.linalg.norm(forward):  # straight down or up: any direction is right
+            right = np.array([1.0, 0.0, 0.0])
+        columns = np.stack([right, np.cross(forward, right), forward], axis=1)
+        lengths = np.linalg.norm(columns, axis=0)
+        if not lengths.min() > 0:
+            raise ValueError("expected points somewhere else than in the camera")
+        return columns / lengths, place
+
+    def to_optical(self, points: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return points (..., 3) in the camera's optical frame, and a note about that."""
+        rotation, place = self.pose(points)
+        at, turn = (
+            " ".join(f"{value:.6g}" for value in values) for values in (place, quaternions.from_matrix(rotation))
+        )
+        note = f"results are in the frame of a camera at {at}, turned {turn} (x y z w)"
+        return move(points, rotation.T, -rotation.T @ place), note
+
+
+def move(points: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
+    """Return R p + t of points (..., 3); NaN where nothing was measured, which is NaN or (0, 0, 0) before."""
+    there = points.any(axis=-1, keepdims=True)
+    return np.where(there, points @ rotation.T + shift, np.nan).astype(points.dtype)

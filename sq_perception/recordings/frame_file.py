@@ -33,14 +33,14 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from sq_perception.files.unpacking import exr_image, grey_image, npy_array, npz_arrays
+from sq_perception.files.unpacking import exr_image, grey_image, label_image, npy_array, npz_arrays
 from sq_perception.imaging import depth_units, unit_cube
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.imaging.depth_units import MILLIMETRES, DepthKind, Metres, Stated
-from sq_perception.recordings import cloud_file, mask_file
+from sq_perception.recordings import cloud_file
 from sq_perception.recordings.camera_file import FrameError, calibration, camera_beside, read_camera_info
-from sq_perception.recordings.cloud_frame import CloudFrame
+from sq_perception.recordings.cloud_file import CloudFrame
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
 TUM = Stated(5000.0, "the name is one of the TUM RGB-D benchmark")
@@ -120,7 +120,7 @@ class Reading:
     region : (4,) of int or None
         Left column, top row, width and height of the part to look at, pixels of the rectified image.
     masks : Path or None
-        A folder with the masks of each frame, by its name (:mod:`sq_perception.recordings.mask_file`).
+        A folder with the masks of each frame, by its name (:func:`sq_perception.files.unpacking.label_image`).
     ignore_masks : bool
         Whether no labels are read, wherever they are.
     kind : str
@@ -170,9 +170,9 @@ class Reading:
         if self.masks is None or self.ignore_masks:
             return None
         try:
-            labels = mask_file.read(self.masks, name)
+            labels = label_image(self.masks, name)
         except ValueError as error:
-            raise FrameError(str(error)) from error
+            raise FrameError(f"{self.masks / name}.png: {error}") from error
         if labels.shape != like.shape:
             raise FrameError(
                 f"{self.masks / name}: expected labels of the depth's shape {like.shape}, got {labels.shape}"
@@ -331,7 +331,7 @@ def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
     points, labels = cloud_file.read_cloud(path)
     points, notes = points / (reading.scale or 1.0), []
     if reading.frame is not None:
-        points, said = reading.frame.optical(points)
+        points, said = reading.frame.to_optical(points)
         notes.append(said)
     found = cloud_file.as_image(points, None if reading.ignore_masks else labels)
     if reading.masks is not None and not found.is_image:

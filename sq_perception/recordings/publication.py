@@ -173,11 +173,11 @@ class Findings:
     def move(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
         """The same in another frame, p_new = R(rotation) p + translation; the stamp stays."""
         return Findings(
-            array=poses.moved(self.array, rotation, translation),
-            covariances=poses.moved_covariances(self.covariances, rotation),
+            array=poses.move(self.array, rotation, translation),
+            covariances=poses.turn_covariances(self.covariances, rotation),
             header=poses.header_in(self.header, frame_id),
-            plane=None if self.plane is None else poses.moved_plane(self.plane, rotation, translation),
-            parts=poses.moved(self.parts, rotation, translation),
+            plane=None if self.plane is None else poses.move_plane(self.plane, rotation, translation),
+            parts=poses.move(self.parts, rotation, translation),
         )
 
     def markers(self, alpha: float = ALPHA, types: MessageTypes = installed) -> Any:

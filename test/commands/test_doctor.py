@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 from sq_perception import __version__
-from sq_perception.commands import doctor, main
+from sq_perception.commands import installation, main
 
 
 def test_the_doctor_names_versions_cores_weights_and_kernels(capsys):
@@ -20,8 +20,8 @@ def test_the_doctor_names_versions_cores_weights_and_kernels(capsys):
 
 
 def test_what_is_missing_comes_with_its_remedy(monkeypatch, capsys):
-    monkeypatch.setattr(doctor, "_EXTRAS", {"bags": ("no_such_module",)})
-    monkeypatch.setattr(doctor, "_requirements", lambda: ["no-such-package>=3"])
+    monkeypatch.setattr(installation, "_EXTRAS", {"bags": ("no_such_module",)})
+    monkeypatch.setattr(installation, "_requirements", lambda: ["no-such-package>=3"])
     assert main.main(["doctor"]) == 1
     said = capsys.readouterr().out
     assert "missing no_such_module: pip install 'sq_perception[bags]'" in said
@@ -30,7 +30,8 @@ def test_what_is_missing_comes_with_its_remedy(monkeypatch, capsys):
 
 def test_sources_without_their_requirements_are_a_fault():
     """Run from a checkout nothing says what is required, but the kernels cannot be loaded."""
-    code = "import sys; sys.modules['numba'] = None; from sq_perception.commands.doctor import main; sys.exit(main([]))"
+    code = "import sys; sys.modules['numba'] = None; from sq_perception.commands.installation import doctor; "
+    code += "sys.exit(doctor([]))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False)
     assert done.returncode == 1
     assert "cannot be loaded: " in done.stdout
@@ -41,16 +42,16 @@ def test_kernels_of_other_sources_are_told_from_none(tmp_path):
     code = """
 import os
 from pathlib import Path
-from sq_perception.commands import doctor
+from sq_perception.commands import installation
 from sq_perception.geometry import kernels
-said = [doctor._kernels()[0]]
+said = [installation._kernels()[0]]
 kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0, 0.0, 0.0)
-said += [doctor._kernels()[0]]
+said += [installation._kernels()[0]]
 (file,) = Path(kernels.gauge.stats.cache_path).glob("*.gauge_*.nbi")
 os.utime(file, (0, 0))
-said += [doctor._kernels()[0]]
+said += [installation._kernels()[0]]
 file.rename(file.with_name("kernels.gauge_0123456789ab-1.nbi"))
-print(*said, doctor._kernels()[0], sep="\\n")
+print(*said, installation._kernels()[0], sep="\\n")
 """
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from sq_perception.commands import warm_up
+from sq_perception.commands import installation
 from sq_perception.fitting import levenberg_marquardt
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
@@ -26,7 +26,7 @@ def compiled() -> dict[str, set[object]]:
 
 
 def test_frames_call_no_kernel_that_the_warm_up_did_not_compile() -> None:
-    for _, step in warm_up.steps():
+    for _, step in installation.steps():
         step()
     known = compiled()
     assert len(known) > 100

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import sq_perception
-from sq_perception.commands import warm_up
+from sq_perception.commands.installation import steps
 from sq_perception.geometry import kernel_cache, kernels
 
 PATIENCE = 600
@@ -157,5 +157,5 @@ def test_a_second_process_compiles_beside_a_command_where_there_is_a_core(monkey
     kernel_cache.compile_beside()
     kernel_cache._announce.__wrapped__()
     assert len(started) == count
-    names = [name for name, _ in warm_up.steps()]
+    names = [name for name, _ in steps()]
     assert all(set(command[5:]) <= set(names) for command in started)

@@ -17,7 +17,7 @@ from sq_msgs.action import Recover as RecoverImages
 from sq_msgs.msg import GraspArray, Superquadric, SuperquadricArray
 from sq_msgs.srv import PlanGrasps, Recover
 from sq_msgs_py import superquadrics
-from sq_msgs_py.interfaces import superquadric_array
+from sq_msgs_py.answers import superquadric_array
 from sq_perception.grasping import planner
 from sq_perception.nodes.grasp_node import GraspNode
 from sq_perception.tracking import association

@@ -26,9 +26,8 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import outputs as outputs_module
 from sq_perception.nodes.frame import Frame
-from sq_perception.nodes.live_parameters import ParameterError
 from sq_perception.nodes.outputs import OptionalOutputs, in_frame
-from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.nodes.parameters import ParameterError, RecoverParameters
 from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified

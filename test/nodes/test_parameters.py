@@ -18,8 +18,16 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sq_perception.nodes.live_parameters import LiveParameters, ParameterError, describe
-from sq_perception.nodes.parameters import KINDS, RecoverParameters, SyntheticParameters
+from sq_perception.nodes.grasp_node import GraspParameters
+from sq_perception.nodes.parameters import FitterParameters, LiveParameters, ParameterError, RecoverParameters, describe
+from sq_perception.nodes.synthetic_depth_node import SyntheticParameters
+
+KINDS = {
+    "recover_node": RecoverParameters,
+    "fitter_node": FitterParameters,
+    "grasp_node": GraspParameters,
+    "synthetic_depth_node": SyntheticParameters,
+}
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +67,7 @@ def test_the_shipped_file_holds_every_parameter_with_its_default(name, repositor
 def test_the_reference_is_what_the_generator_writes(repository, monkeypatch):
     monkeypatch.syspath_prepend(repository / "docs_build")
     reference: Any = importlib.import_module("parameter_reference")
+    assert reference.KINDS == KINDS
     for name in KINDS:
         written = (repository / "config" / f"{name}.yaml").read_text(encoding="utf-8")
         assert written == reference.yaml_text(name), "run python docs_build/parameter_reference.py"

@@ -15,11 +15,9 @@ from spun_nodes import SpunNodes
 
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.live_parameters import ParameterError
-from sq_perception.nodes.parameters import SyntheticParameters
-from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
+from sq_perception.nodes.parameters import ParameterError
+from sq_perception.nodes.synthetic_depth_node import FrameSource, SyntheticDepthNode, SyntheticParameters, frame_source
 from sq_perception.recordings.frame_file import FrameError
-from sq_perception.recordings.frame_source import FrameSource
 
 
 def names(source: FrameSource, count: int) -> list[str | None]:

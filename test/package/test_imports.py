@@ -118,7 +118,7 @@ def test_messages_need_numpy_and_messages_only() -> None:
 def test_messages_that_a_robot_may_lack_are_imported_when_they_are_made() -> None:
     pytest.importorskip("shape_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
     absent = "import sys; sys.modules.update(dict.fromkeys(('vision_msgs', 'moveit_msgs', 'tf2_msgs', 'tf2_ros')))"
-    modules = loaded_after(f"{absent}; import sq_msgs_py.detections, sq_msgs_py.collision_objects")
+    modules = loaded_after(f"{absent}; import sq_msgs_py.poses, sq_msgs_py.collision_objects")
     assert "sq_msgs_py.shapes" in modules
     assert not modules & {"torch", "sq_perception", "scipy", "rclpy"}
 

@@ -12,8 +12,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings import cloud_file
-from sq_perception.recordings.cloud_file import UNORGANISED
-from sq_perception.recordings.cloud_frame import CloudFrame, moved
+from sq_perception.recordings.cloud_file import UNORGANISED, CloudFrame, move
 from sq_perception.recordings.frame_file import FrameError, Reading, read
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation import support_plane
@@ -194,7 +193,7 @@ def test_a_cloud_in_another_frame_is_seen_from_its_camera(tmp_path):
     depth, cloud = points()
     cloud[0, 0] = 0.0  # nothing measured, in any frame
     turn, place = quaternions.normalize(np.array([0.6, -0.5, 0.4, -0.5])), np.array([0.3, -0.4, 1.2])
-    there = moved(cloud, quaternions.to_matrix(turn), place)
+    there = move(cloud, quaternions.to_matrix(turn), place)
     there[0, 0] = 0.0
     np.savez(tmp_path / "a.npz", points=there)
     pose = ",".join(str(number) for number in (*place, *turn))
@@ -213,7 +212,7 @@ def test_a_cloud_in_another_frame_is_seen_from_its_camera(tmp_path):
 @pytest.mark.parametrize(("name", "point"), [("link", [1.0, -0.2, -0.1]), ("graphics", [0.2, -0.1, -1.0])])
 def test_axes_around_the_camera_have_names(name, point):
     """A point a metre before the camera, 0.2 m to its right and 0.1 m below."""
-    seen, _ = CloudFrame.parse(name).optical(np.array([point]))
+    seen, _ = CloudFrame.parse(name).to_optical(np.array([point]))
     np.testing.assert_allclose(seen, [[0.2, 0.1, 1.0]], atol=1e-12)
 
 
@@ -225,7 +224,7 @@ def test_what_is_no_place_of_a_camera_is_refused(text):
 
 def test_a_camera_may_look_straight_down(rng):
     flat = np.concatenate([rng.uniform(-0.2, 0.2, (500, 2)), np.zeros((500, 1))], axis=1) + 1e-9
-    seen, _ = CloudFrame.parse("0,0,1").optical(flat)
+    seen, _ = CloudFrame.parse("0,0,1").to_optical(flat)
     np.testing.assert_allclose(seen[:, 2], 1.0, atol=0.02)
 
 

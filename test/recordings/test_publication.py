@@ -73,7 +73,7 @@ def test_deviations_are_along_and_about_the_axes_of_the_body():
     np.testing.assert_allclose(shown.sigma_shape, [[0.03, 0.05]], rtol=1e-6)
     np.testing.assert_allclose(shown.sigma_centre, [[0.002, 0.001, 0.003]], rtol=1e-6)
     np.testing.assert_allclose(shown.sigma_turn, [[0.02, 0.03, 0.04]], rtol=1e-6)
-    moved = poses.moved(shown, np.array([0.3, 0.1, 0.2, 0.9]), np.array([1.0, 2.0, 3.0]))
+    moved = poses.move(shown, np.array([0.3, 0.1, 0.2, 0.9]), np.array([1.0, 2.0, 3.0]))
     for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn", "reason"):
         np.testing.assert_array_equal(getattr(moved, column), getattr(shown, column))
 

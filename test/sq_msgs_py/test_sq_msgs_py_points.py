@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sq_msgs_py.points import points_from_message
+from sq_msgs_py.columns import points_from_message
 from sq_msgs_py.superquadrics import MessageError
 
 POINTS = np.arange(24, dtype=float).reshape(2, 4, 3)

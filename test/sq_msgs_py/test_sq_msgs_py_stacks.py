@@ -16,9 +16,8 @@ from std_msgs.msg import Header
 
 from sq_msgs_py import poses
 from sq_msgs_py.collision_objects import Scene, collision_objects, planning_scene, removals
-from sq_msgs_py.detections import detections
+from sq_msgs_py.poses import body_name, detections, transforms
 from sq_msgs_py.superquadrics import CONVERGED, FAILED, WEAK, SuperquadricArray
-from sq_msgs_py.transforms import name, transforms
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import mesh
 from sq_perception.geometry.superquadric import Superquadric
@@ -63,7 +62,7 @@ def test_recovered_bodies_keep_their_order():
 
 
 def test_a_quarter_turn_and_a_shift_by_hand():
-    found = poses.moved(three(), 3 * QUARTER_ABOUT_Z, np.array([10.0, 0.0, 0.0]))
+    found = poses.move(three(), 3 * QUARTER_ABOUT_Z, np.array([10.0, 0.0, 0.0]))
     np.testing.assert_allclose(found.translation[0], [8.0, 1.0, 3.0], atol=1e-6)
     # 2 atan(0.6 / 0.8) about z and 90 degrees more.
     angle = 2 * np.arctan2(0.6, 0.8) + np.pi / 2
@@ -77,14 +76,14 @@ def test_moving_an_array_is_moving_its_bodies():
     rng = np.random.default_rng(3)
     turn, shift = quaternions.random(1, rng)[0], rng.normal(size=3)
     array = replace(three(), rotation=quaternions.random(3, rng))
-    there = poses.moved(array, turn, shift)
+    there = poses.move(array, turn, shift)
     for k in range(3):
         one = Superquadric(*(getattr(array, c)[k].astype(float) for c in ("size", "shape", "translation", "rotation")))
         expected = one.transformed(turn, shift)
         np.testing.assert_allclose(there.translation[k], expected.translation, atol=1e-6)
         assert quaternions.geodesic_angle(there.rotation[k].astype(float), expected.rotation) < 1e-5
     back = quaternions.conjugate(turn)
-    again = poses.moved(there, back, -quaternions.to_matrix(back) @ shift)
+    again = poses.move(there, back, -quaternions.to_matrix(back) @ shift)
     np.testing.assert_allclose(again.translation, array.translation, atol=1e-6)
     np.testing.assert_allclose(np.abs(np.sum(again.rotation * array.rotation, axis=1)), 1, atol=1e-6)
 
@@ -94,15 +93,15 @@ def test_covariances_turn_with_the_frame():
     turn = quaternions.random(1, rng)[0]
     factor = rng.normal(size=(2, 6, 6))
     known = factor @ np.swapaxes(factor, 1, 2)
-    found = poses.moved_covariances(known, 2 * turn)
+    found = poses.turn_covariances(known, 2 * turn)
     change = np.zeros((6, 6))
     change[:3, :3] = change[3:, 3:] = quaternions.to_matrix(turn)
     np.testing.assert_allclose(found, [change @ one @ change.T for one in known], atol=1e-12)
-    assert np.isnan(poses.moved_covariances(np.full((1, 6, 6), np.nan), turn)).all()
+    assert np.isnan(poses.turn_covariances(np.full((1, 6, 6), np.nan), turn)).all()
 
 
 def test_an_empty_array_moves_and_a_header_keeps_its_stamp():
-    assert len(poses.moved(SuperquadricArray.empty(), QUARTER_ABOUT_Z, np.zeros(3))) == 0
+    assert len(poses.move(SuperquadricArray.empty(), QUARTER_ABOUT_Z, np.zeros(3))) == 0
     header = poses.header_in(HEADER, "map")
     assert (header.frame_id, header.stamp) == ("map", HEADER.stamp)
     assert HEADER.frame_id == "optical"
@@ -115,7 +114,7 @@ def test_an_empty_array_moves_and_a_header_keeps_its_stamp():
 )  # fmt: skip
 def test_what_is_no_motion_is_refused(rotation, translation):
     with pytest.raises(ValueError, match=r"rotation|motion"):
-        poses.moved(three(), np.array(rotation), np.array(translation))
+        poses.move(three(), np.array(rotation), np.array(translation))
 
 
 # Transforms
@@ -268,8 +267,8 @@ def test_a_round_body_at_rest_is_sent_once():
 
 
 def test_names():
-    assert name(np.uint32(7)) == "superquadric_7"
-    assert name(7, "left_") == "left_7"
+    assert body_name(np.uint32(7)) == "superquadric_7"
+    assert body_name(7, "left_") == "left_7"
 
 
 @pytest.mark.parametrize(("package", "make"), [("vision_msgs", detections), ("moveit_msgs", collision_objects)])
@@ -291,5 +290,5 @@ def test_a_plane_is_a_pose_on_it_with_z_along_its_normal(normal: list[float]) ->
     turn, shift = np.array([0.1, 0.5, -0.3, 0.8]), np.array([1.0, 2.0, 3.0])
     points = np.array([[0.3, 0.1, 0.9], [-0.2, 0.4, 1.5]])
     there = points @ poses.matrices(poses.unit_quaternions(turn)).T + shift
-    moved = poses.moved_plane(plane, turn, shift)
+    moved = poses.move_plane(plane, turn, shift)
     np.testing.assert_allclose(there @ moved[:3] + moved[3], points @ plane[:3] + plane[3], atol=1e-12)

@@ -1,4 +1,4 @@
-"""``sq-perception render``: one superquadric as a depth image, with its camera."""
+"""``sq-perception sample`` and ``render``: simulated frames with their cameras."""
 
 from __future__ import annotations
 
@@ -25,18 +25,51 @@ if TYPE_CHECKING:
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging.camera import Camera
 
-PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
-_LONGEST = 10**6
-"""Pixels of a side that OpenCV and libpng write and read."""
 
-_HELP = """\
+_SAMPLE_HELP = """\
+Write a simulated RealSense D435 depth image of four objects on a table, and print their true sizes.
+The NPZ holds what `sq-perception recover` reads of one: depth (metres, NaN = no reading) and K (3 x 3).
+"""
+_SAMPLE_EPILOG = """\
+examples:
+  sq-perception sample table.npz
+  sq-perception recover table.npz --html page.html
+"""
+
+
+def sample(arguments: Sequence[str]) -> int:
+    """Run ``sq-perception sample``; return the exit code."""
+    command = parser("sample", _SAMPLE_HELP, _SAMPLE_EPILOG)
+    command.add_argument("output", type=target, metavar="FILE", help="an .npz")
+    output = command.parse_args(arguments).output
+    if output.suffix.lower() != ".npz":
+        return reject_usage(f"{output}: expected a name that ends in .npz")
+
+    import numpy as np
+
+    from sq_perception.recovery.recovery import edges_as_text, place_as_text
+    from sq_perception.simulation import sample as simulation
+
+    made = simulation.sample()
+    with output_file.writing(output) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, depth=made.depth, K=made.camera.matrix)
+    unknown = [np.nan] * 3
+    print(f"{output}: {made.camera.width} x {made.camera.height}, a simulated RealSense D435; true full edges")
+    for name, body in zip(made.names, made.bodies, strict=True):
+        edges = edges_as_text(body.size, unknown, is_cube=False)
+        print(f"  {name:8}{edges:22} at {place_as_text(body.translation, is_cube=False)}")
+    return SUCCESS
+
+
+PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
+_RENDER_HELP = """\
 Draw one superquadric as a depth image.
 
 The 12 parameters: half sizes a1 a2 a3, exponents e1 e2 in (0, 2], centre t1 t2 t3, rotation quaternion x y z w (object
 to frame).  Orthographic: in the unit cube (x right, y up, z to the viewer).  Pinhole: metres in the optical frame
 (x right, y down, z forward).
 """
-_EPILOG = """\
+_RENDER_EPILOG = """\
 examples:
   sq-perception render 0.25 0.15 0.1  0.2 0.8  0.5 0.5 0.5  0.2 0.3 0.1 0.9 --output view.png
   sq-perception render 0.05 0.04 0.1  0.1 1.0  0 0 0.8  0.7 0 0 0.7 --projection pinhole --output can.npz
@@ -49,9 +82,9 @@ files:
 """
 
 
-def main(arguments: Sequence[str]) -> int:
+def render(arguments: Sequence[str]) -> int:
     """Run ``sq-perception render``; return the exit code."""
-    command = parser("render", _HELP, _EPILOG)
+    command = parser("render", _RENDER_HELP, _RENDER_EPILOG)
     add = command.add_argument
     for name in PARAMETERS:
         add(name, type=float)
@@ -92,8 +125,9 @@ def _render(options: argparse.Namespace) -> int:
     except ValueError as error:
         return reject_usage(str(error))
     width, height = camera.width, camera.height
-    if width * height > MOST_PIXELS or max(width, height) > _LONGEST:  # nor would any command read it
-        expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {_LONGEST}"
+    longest = 10**6  # that OpenCV and libpng write and read
+    if width * height > MOST_PIXELS or max(width, height) > longest:  # nor would any command read it
+        expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {longest}"
         return reject_usage(f"{expected}, got {width} x {height}")
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
@@ -116,6 +150,7 @@ def _camera(options: argparse.Namespace) -> Camera:
 def _write_depth(output: Path, depth: np.ndarray, index: np.ndarray, camera: Camera, body: Superquadric) -> None:
     import cv2
     import numpy as np
+    import yaml
 
     from sq_perception.imaging import unit_cube
 
@@ -136,26 +171,10 @@ def _write_depth(output: Path, depth: np.ndarray, index: np.ndarray, camera: Cam
         image = np.where(millimetres <= most, millimetres, 0).astype(np.uint16)
         if (millimetres[index >= 0] > most).any():
             complain(f"what is beyond 65.535 m is left out: {output.name} holds no more, an .npz does")
-        _write_camera_info(output.with_suffix(".yaml"), camera)
+        numbers = {"rows": 3, "cols": 3, "data": camera.matrix.ravel().tolist()}
+        info = {"image_width": camera.width, "image_height": camera.height, "camera_matrix": numbers}
+        output_file.write(output.with_suffix(".yaml"), yaml.safe_dump(info, sort_keys=False).encode())
     else:
         image = unit_cube.grey_from_depth(depth)
     _, encoded = cv2.imencode(output.suffix.lower(), image)
     output_file.write(output, encoded.tobytes())
-
-
-def _write_camera_info(path: Path, camera: Camera) -> None:
-    import numpy as np
-    import yaml
-
-    k = camera.matrix
-    info = {
-        "image_width": camera.width,
-        "image_height": camera.height,
-        "camera_name": "depth",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": k.ravel().tolist()},
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": np.hstack([k, np.zeros((3, 1))]).ravel().tolist()},
-    }
-    output_file.write(path, yaml.safe_dump(info, sort_keys=False).encode())

@@ -1,16 +1,73 @@
-"""``thing-views`` and ``segment-views`` draw views into a folder, ``train-things`` and ``train-masks`` train on it."""
+"""``sq-perception train``, and the networks of views in shards: ``thing-views`` and ``segment-views`` draw views into a
+folder, ``train-things`` and ``train-masks`` train on it.
+"""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, fail, parser, positive
-from sq_perception.learning.training_config import MASK_RUN, THING_RUN, ShardTraining
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, fail, parser, positive, progress
+from sq_perception.learning import training_config
+from sq_perception.learning.training_config import CHOICES, MASK_RUN, THING_RUN, ShardTraining, TrainingConfig
+
+_HELP = """\
+Train the network with any loss of the thesis.  Defaults of the options come from --config if given.
+
+The output folder holds state.safetensors, from which the same command continues, log.jsonl,
+last.safetensors (the newest validated network) and model.safetensors (the best one so far).
+"""
+_EPILOG = """\
+examples:
+  sq-perception train --steps 20000 --output runs/compact
+  sq-perception train --config render --output runs/render
+"""
+
+
+def train(arguments: Sequence[str]) -> int:
+    """Run ``sq-perception train``; return the exit code."""
+    command = parser("train", _HELP, _EPILOG)
+    command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
+    shipped = ", ".join(training_config.shipped_names())
+    command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
+    for field in fields(TrainingConfig):
+        name = "--" + field.name.replace("_", "-")
+        default, text = argparse.SUPPRESS, f"{field.metadata['help']} (default {field.default!r})"
+        if isinstance(field.default, bool):
+            command.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
+        else:
+            choices = CHOICES.get(field.name)
+            command.add_argument(name, type=type(field.default), choices=choices, default=default, help=text)
+    options = vars(command.parse_args(arguments))
+    output, file = options.pop("output"), options.pop("config")
+    try:
+        config = TrainingConfig(**options) if file is None else training_config.read(file, **options)
+    except ValueError as error:
+        command.error(str(error))
+
+    from sq_perception.learning import train as training
+    from sq_perception.learning.checkpoint import CheckpointError
+
+    try:
+        with progress() as bar:
+            task = bar.add_task("training", total=config.steps)
+            training.train(
+                config,
+                output,
+                advance=lambda step, loss: bar.update(task, completed=step, description=f"loss {loss:.4f}"),
+            )
+    except training.Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        return INTERRUPTED
+    except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
+        return fail(f"train: {error}")
+    return SUCCESS
+
 
 _DRAW = """\
 Draw {what} into a folder, shard by shard.
@@ -29,7 +86,7 @@ The same command continues a stopped run.  The output folder holds the state, a 
 def thing_views(arguments: Sequence[str]) -> int:
     """Run ``sq-perception thing-views``; return the exit code."""
     example = "sq-perception thing-views sets/things --shards 200 && sq-perception train-things sets/things"
-    command = _drawing("thing-views", "canonical views of simulated household objects", example, shards=100)
+    command = _make_drawing_parser("thing-views", "canonical views of simulated household objects", example, shards=100)
     command.add_argument("--views", type=at_least(1), default=512, help="views per shard (512)")
     command.add_argument(
         "--meshes", type=Path, metavar="FOLDER", help="your own objects, in metres, for half of the views"
@@ -50,7 +107,7 @@ def segment_views(arguments: Sequence[str]) -> int:
     """Run ``sq-perception segment-views``; return the exit code."""
     example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
     what = "segments of simulated scenes, and which of their readings are of their object,"
-    command = _drawing("segment-views", what, example, shards=40)
+    command = _make_drawing_parser("segment-views", what, example, shards=40)
     command.add_argument("--scenes", type=at_least(1), default=200, help="a shard, of some eleven views each (200)")
     given = command.parse_args(arguments)
 
@@ -67,7 +124,7 @@ def train_things(arguments: Sequence[str]) -> int:
         weights="things.safetensors, which `recover --model` takes",
     )
     example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"
-    options = vars(_training("things", text, example, THING_RUN).parse_args(arguments))
+    options = vars(_make_training_parser("things", text, example, THING_RUN).parse_args(arguments))
 
     from sq_perception.learning.thing_training import THINGS
 
@@ -80,14 +137,14 @@ def train_masks(arguments: Sequence[str]) -> int:
         what="finds outliers in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
     )
     example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
-    options = vars(_training("masks", text, example, MASK_RUN).parse_args(arguments))
+    options = vars(_make_training_parser("masks", text, example, MASK_RUN).parse_args(arguments))
 
     from sq_perception.learning.mask_training import MASKS
 
     return _train(MASKS, MASK_RUN, options)
 
 
-def _drawing(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
+def _make_drawing_parser(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
     """Make the common parser of both commands that draw."""
     command = parser(name, _DRAW.format(what=what), f"example:\n  {example}")
     add = command.add_argument
@@ -111,7 +168,7 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
     return SUCCESS
 
 
-def _training(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
+def _make_training_parser(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
     """Make the common parser of both commands that train."""
     command = parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
@@ -132,12 +189,12 @@ def _training(subject: str, text: str, example: str, run: ShardTraining) -> argp
 
 
 def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
+    from sq_perception.learning import shard_training
     from sq_perception.learning.checkpoint import CheckpointError
-    from sq_perception.learning.shard_training import train
 
     views, output = options.pop("views"), options.pop("output")
     try:
-        train(subject, replace(run, **options), views, output)
+        shard_training.train(subject, replace(run, **options), views, output)
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
         return fail(f"train-{subject.name}: {error}")
     except KeyboardInterrupt:
