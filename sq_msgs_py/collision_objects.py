@@ -97,14 +97,9 @@ class Scene:
     ) -> list[CollisionObject]:
         """Objects to ADD and to REMOVE after another frame, by :func:`collision_objects` and :func:`removals`.
 
-        Parameters
-        ----------
-        hidden
-            Ids of bodies that the frame does not show and that are not given up.
-        rests
-            Whether the header's frame does: where it moves, what is hidden is no longer where it was sent to.
-        meshes
-            Makes those of the bodies that did not fail, where they are needed.
+        ``hidden``: ids of bodies that the frame does not show and that are not given up.  ``rests``: whether the
+        header's frame does: where it moves, what is hidden is no longer where it was sent to.  ``meshes``: makes those
+        of the bodies that did not fail, where they are needed.
         """
         known_as = header.frame_id, meshes is not None
         if known_as != self._known_as:
@@ -143,7 +138,7 @@ class Scene:
 
 
 def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
-    """Whether the space that a body takes has changed by more than a step since planners were sent it.
+    """Return whether the space that a body takes has changed by more than a step since planners were sent it.
 
     By how far both reach in every direction, the Hausdorff distance of convex bodies: numbers are no measure, as those
     of a round body at rest turn about its axis from frame to frame.
@@ -167,24 +162,12 @@ def collision_objects(
     meshes: Sequence[Mesh] | None = None,
     prefix: str = PREFIX,
 ) -> list[CollisionObject]:
-    """One object to ADD for each body that did not fail; one of the same id that is there already is replaced.
+    """Return one object to ADD for each body that did not fail; one of the same id that is there already is replaced.
 
-    Parameters
-    ----------
-    header
-        std_msgs/Header of the bodies.
-    meshes
-        One for each body that did not fail, on its surface and in its own frame; they are grown by
-        :func:`~sq_msgs_py.shapes.enclosing_factor`.  None: enclosing primitives.
-    prefix
-        Of the ids.
-
-    Raises
-    ------
-    ImportError
-        Without moveit_msgs.
-    ValueError
-        If the number of meshes is another, or a mesh or body is none.
+    ``header``: std_msgs/Header of the bodies.  ``meshes``: one for each body that did not fail, on its surface and in
+    its own frame; they are grown by :func:`~sq_msgs_py.shapes.enclosing_factor`.  None: enclosing primitives.
+    ``prefix``: of the ids.  Raises ImportError without moveit_msgs; ValueError if the number of meshes is another, or a
+    mesh or body is none.
     """
     from moveit_msgs.msg import CollisionObject
 
@@ -208,14 +191,9 @@ def collision_objects(
 
 
 def removals(names: Iterable[str], header: Any) -> list[CollisionObject]:
-    """One object to REMOVE for each name.
+    """Return one object to REMOVE for each name.
 
-    Raises
-    ------
-    ImportError
-        Without moveit_msgs.
-    ValueError
-        For an empty name: MoveIt would remove every object of the scene.
+    Raises ImportError without moveit_msgs; ValueError for an empty name: MoveIt would remove every object of the scene.
     """
     from moveit_msgs.msg import CollisionObject
 
@@ -226,7 +204,7 @@ def removals(names: Iterable[str], header: Any) -> list[CollisionObject]:
 
 
 def planning_scene(objects: Sequence[CollisionObject]) -> PlanningScene:
-    """The difference that applies the objects and changes nothing else; ImportError without moveit_msgs."""
+    """Return the difference that applies the objects and changes nothing else; ImportError without moveit_msgs."""
     from moveit_msgs.msg import PlanningScene
 
     message = PlanningScene(is_diff=True)

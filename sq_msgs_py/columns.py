@@ -39,13 +39,9 @@ def column(*names: str, is_finite: bool = False, missing: float = np.nan) -> Map
 class Columns:
     """n rows of numbers: the base of frozen dataclasses whose fields are columns (n,) or (n, k), by :func:`column`.
 
-    ``FIELDS`` are those of the message.  A column that is None is 0 or NaN.
-
-    Raises
-    ------
-    ValueError
-        If a column has another shape than the first one asks for, holds what is not finite and has to be, or one of its
-        integers is no unsigned 32 bit integer.
+    ``FIELDS`` are those of the message.  A column that is None is 0 or NaN.  Raises ValueError if a column has another
+    shape than the first one asks for, holds what is not finite and has to be, or one of its integers is no unsigned 32
+    bit integer.
     """
 
     FIELDS: ClassVar[Fields]
@@ -125,11 +121,8 @@ def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) 
 def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str]) -> np.ndarray:
     """Return the points (n,) of a cloud as a structured array of those of the described fields that are there.
 
-    Raises
-    ------
-    MessageError
-        If a field that is needed is missing, one has an unknown datatype, a count other than one or an offset outside
-        the point, or if the data is not as long as width, height and steps require.
+    Raises MessageError if a field that is needed is missing, one has an unknown datatype, a count other than one or an
+    offset outside the point, or if the data is not as long as width, height and steps require.
     """
     order = ">" if message.is_bigendian else "<"
     present = {field.name: field for field in message.fields}

@@ -48,12 +48,8 @@ def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYP
     """The pixels (height, width) of a single-channel image as they lie in the message: a view, nothing is copied.
 
     Rows may be padded (``step``) and bytes may be swapped (``is_bigendian``); the array's strides and dtype follow.
-
-    Raises
-    ------
-    ImageError
-        If the encoding is none of ``encodings``, the image is empty, the step is shorter than a row, or the data is not
-        height x step bytes long.
+    Raises ImageError if the encoding is none of ``encodings``, the image is empty, the step is shorter than a row, or
+    the data is not height x step bytes long.
     """
     if message.encoding not in encodings:
         raise ImageError(f"encoding: expected {' or '.join(encodings)}, got {message.encoding!r}")
@@ -74,40 +70,29 @@ def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYP
 
 
 def grey_from_message(message: Image) -> np.ndarray:
-    """Grey values, uint8 or uint16 (height, width), of a mono8 or mono16 image; a copy in native byte order.
+    """Return grey values, uint8 or uint16 (height, width), of a mono8 or mono16 image; a copy in native byte order.
 
-    Raises
-    ------
-    ImageError
-        As :func:`pixels_from_message`.
+    Raises ImageError as :func:`pixels_from_message`.
     """
     pixels = pixels_from_message(message, GREY_ENCODINGS)
     return pixels.astype(pixels.dtype.newbyteorder("="))
 
 
 def labels_from_message(message: Image) -> np.ndarray:
-    """Instance labels, int32 (height, width); 0 and everything below it is background.
+    """Return instance labels, int32 (height, width); 0 and everything below it is background.
 
-    Raises
-    ------
-    ImageError
-        As :func:`pixels_from_message`; the encodings are those of ``LABEL_ENCODINGS``.
+    Raises ImageError as :func:`pixels_from_message`; the encodings are those of ``LABEL_ENCODINGS``.
     """
     labels = pixels_from_message(message, LABEL_ENCODINGS).astype(np.int32)
     return np.maximum(labels, 0, out=labels)
 
 
 def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", types: MessageTypes = installed) -> Image:
-    """An image message of depth (height, width) in metres.
+    """Return an image message of depth (height, width) in metres.
 
     32FC1 holds the values as they are.  16UC1 holds the nearest millimetre; what is not finite, below half a
-    millimetre, or beyond 65.535 m becomes 0.
-
-    Raises
-    ------
-    ImageError
-        If the array has not two dimensions with at least one pixel, is no floating point array, or the encoding is
-        neither 16UC1 nor 32FC1.
+    millimetre, or beyond 65.535 m becomes 0.  Raises ImageError if the array has not two dimensions with at least one
+    pixel, is no floating point array, or the encoding is neither 16UC1 nor 32FC1.
     """
     depth = np.asarray(depth)
     if not np.issubdtype(depth.dtype, np.floating):
@@ -122,12 +107,9 @@ def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", ty
 
 
 def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = installed) -> Image:
-    """A mono8 or mono16 message of uint8 or uint16 grey values (height, width).
+    """Return a mono8 or mono16 message of uint8 or uint16 grey values (height, width).
 
-    Raises
-    ------
-    ImageError
-        For another dtype or not two dimensions.
+    Raises ImageError for another dtype or not two dimensions.
     """
     grey = np.asarray(grey)
     encoding = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16"}.get(grey.dtype)
@@ -139,12 +121,10 @@ def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = install
 def labels_to_message(
     labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = installed
 ) -> Image:
-    """A label image message of integer labels (height, width).
+    """Return a label image message of integer labels (height, width).
 
-    Raises
-    ------
-    ImageError
-        If the labels are not integers, do not fit the encoding, or the encoding is none of ``LABEL_ENCODINGS``.
+    Raises ImageError if the labels are not integers, do not fit the encoding, or the encoding is none of
+    ``LABEL_ENCODINGS``.
     """
     labels = np.asarray(labels)
     if encoding not in LABEL_ENCODINGS:
@@ -175,14 +155,8 @@ class Intrinsics:
 class RawIntrinsics:
     """What a camera_info holds of the image before rectification.
 
-    Attributes
-    ----------
-    intrinsics : Intrinsics
-        Of K: the pixel of a ray whose image the lens puts at (x', y') is (fx x' + cx, fy y' + cy).
-    distortion_model : str
-        As it stands in the message.
-    distortion : tuple of float
-        D.
+    ``intrinsics``: of K: the pixel of a ray whose image the lens puts at (x', y') is (fx x' + cx, fy y' + cy).
+    ``distortion_model``: as it stands in the message.  ``distortion``: D.
     """
 
     intrinsics: Intrinsics
@@ -194,13 +168,8 @@ def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
     """Intrinsics of the rectified image that travels with a camera_info; region of interest and binning are applied.
 
     The projection matrix P counts, and K where P is not set; both describe the full resolution.  For an image that is
-    not rectified see :func:`raw_intrinsics_from_message`.
-
-    Raises
-    ------
-    ImageError
-        If the camera is not calibrated (K and P zero or not finite), no camera could have such intrinsics, or the image
-        size is below 1 x 1.
+    not rectified see :func:`raw_intrinsics_from_message`.  Raises ImageError if the camera is not calibrated (K and P
+    zero or not finite), no camera could have such intrinsics, or the image size is below 1 x 1.
     """
     fx, cx, fy, cy = (float(message.p[i]) for i in (0, 2, 5, 6))
     if fx == 0.0 and fy == 0.0:
@@ -212,12 +181,8 @@ def raw_intrinsics_from_message(message: CameraInfo) -> RawIntrinsics:
     """K and distortion of the raw image that travels with a camera_info; region of interest and binning are applied.
 
     K describes the full resolution.  Distortion acts on rays before they become pixels, so that a part of the image or
-    binned pixels have the same.
-
-    Raises
-    ------
-    ImageError
-        If the camera is not calibrated (K zero or not finite), the image size is below 1 x 1, or D is not finite.
+    binned pixels have the same.  Raises ImageError if the camera is not calibrated (K zero or not finite), the image
+    size is below 1 x 1, or D is not finite.
     """
     fx, cx, fy, cy = (float(message.k[i]) for i in (0, 2, 4, 5))
     distortion = tuple(float(value) for value in message.d)
@@ -227,7 +192,7 @@ def raw_intrinsics_from_message(message: CameraInfo) -> RawIntrinsics:
 
 
 def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
-    """The complaint where an image (width, height) has not the size in its camera_info; empty if it has."""
+    """Return the complaint where an image (width, height) has not the size in its camera_info; empty if it has."""
     if image == info:
         return ""
     text = f"the image has {image[0]} x {image[1]} pixels, its camera_info is for {info[0]} x {info[1]}"
@@ -242,7 +207,7 @@ def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
 
 
 def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
-    """Intrinsics of the region of interest in its binned pixels from those of the full resolution."""
+    """Return intrinsics of the region of interest in its binned pixels from those of the full resolution."""
     if not all(math.isfinite(number) for number in (fx, fy, cx, cy)):
         raise ImageError(f"camera_info: expected finite fx fy cx cy, got {fx} {fy} {cx} {cy}")
     if fx <= 0.0 or fy <= 0.0:
@@ -273,7 +238,7 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
 
 
 def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = installed) -> CameraInfo:
-    """A camera_info without distortion: K, R = I and P of the intrinsics."""
+    """Return a camera_info without distortion: K, R = I and P of the intrinsics."""
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     return types("sensor_msgs/msg/CameraInfo")(
         header=header,

@@ -39,13 +39,6 @@ FIELDS: tuple[tuple[str, int], ...] = (
 class GraspArray(Columns):
     """n grasps, column by column; see the module for units and conventions.
 
-    Attributes
-    ----------
-    position : (n, 3) float32
-    rotation : (n, 4) float32
-    opening, width, score : (n,) float32
-    id : (n,) uint32
-
     Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
     """
 
@@ -60,23 +53,20 @@ class GraspArray(Columns):
 
 
 def to_message(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
-    """The message of n grasps (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
+    """Return the message of n grasps (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
     return columns.to_message(grasps, header, types)
 
 
 def from_message(message: PointCloud2) -> GraspArray:
-    """The grasps of a message; fields are found by name, unknown ones are left aside.
+    """Return the grasps of a message; fields are found by name, unknown ones are left aside.
 
-    Raises
-    ------
-    MessageError
-        As for superquadrics.
+    Raises MessageError as for superquadrics.
     """
     return columns.from_message(GraspArray, message, [name for name, _ in FIELDS])
 
 
 def poses(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PoseArray:
-    """The poses alone as a geometry_msgs/PoseArray, in the same order."""
+    """Return the poses alone as a geometry_msgs/PoseArray, in the same order."""
     found = poses_at(grasps.position, grasps.rotation, types)
     return types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
 
@@ -95,28 +85,14 @@ def moveit_grasps(
     joints: Sequence[str] = (),
     types: MessageTypes = installed,
 ) -> list[Grasp]:
-    """A moveit_msgs/Grasp for each, in the same order; its quality is the score.
+    """Return a moveit_msgs/Grasp for each, in the same order; its quality is the score.
 
-    Parameters
-    ----------
-    header
-        std_msgs/Header of the grasps.
-    link, link_from_tcp
-        The parent link of the end effector and position and quaternion of the TCP in it; of
-        :class:`sq_perception.grasping.gripper.Gripper` where that link is the gripper's.
-    up : (3,)
-        Away from the table in the frame of the header, of length 1: the way of the retreat.  None: back as it came.
-    prefix
-        Of the ids of collision objects, which the fingers may touch: :data:`sq_msgs_py.poses.PREFIX`.
-    joints
-        Those of the fingers, each of which moves by half of the opening; none leaves both postures empty.
-
-    Raises
-    ------
-    ImportError
-        Without moveit_msgs.
-    ValueError
-        If a quaternion names no rotation.
+    ``header``: std_msgs/Header of the grasps.  ``link``, ``link_from_tcp``: the parent link of the end effector and
+    position and quaternion of the TCP in it; of :class:`sq_perception.grasping.gripper.Gripper` where that link is the
+    gripper's.  ``up`` (3,): Away from the table in the frame of the header, of length 1: the way of the retreat.  None:
+    back as it came.  ``prefix``: of the ids of collision objects, which the fingers may touch:
+    :data:`sq_msgs_py.poses.PREFIX`.  ``joints``: those of the fingers, each of which moves by half of the opening; none
+    leaves both postures empty.  Raises ImportError without moveit_msgs; ValueError if a quaternion names no rotation.
     """
     grasp, translation = types("moveit_msgs/msg/Grasp"), types("moveit_msgs/msg/GripperTranslation")
     stamped, vector = types("geometry_msgs/msg/Vector3Stamped"), types("geometry_msgs/msg/Vector3")

@@ -58,23 +58,10 @@ def markers(
 ) -> MarkerArray:
     """Return markers of n bodies, which replace all earlier ones.
 
-    Parameters
-    ----------
-    meshes, ids
-        n meshes and their ids, 0 to 2^31 - 1, each once.
-    header
-        std_msgs/Header of the image that the bodies were recovered from.
-    colours
-        (n, 3) RGB, 0 to 1; by default the palette's colour of each id.
-    alpha
-        Opacity of surfaces.
-    types
-        Where the classes of messages come from.
-
-    Raises
-    ------
-    ValueError
-        If lengths, shapes, ids or face indices do not fit.
+    ``meshes``, ``ids``: n meshes and their ids, 0 to 2^31 - 1, each once.  ``header``: std_msgs/Header of the image
+    that the bodies were recovered from.  ``colours``: (n, 3) RGB, 0 to 1; by default the palette's colour of each id.
+    ``alpha``: opacity of surfaces.  ``types``: where the classes of messages come from.  Raises ValueError if lengths,
+    shapes, ids or face indices do not fit.
     """
     ids = [int(number) for number in ids]
     if len(ids) != len(meshes):

@@ -18,12 +18,9 @@ MessageTypes = Callable[[str], Callable[..., Any]]
 
 
 def installed(name: str) -> Callable[..., Any]:
-    """The class of ``package/msg/Name`` from the message packages of a ROS installation.
+    """Return the class of ``package/msg/Name`` from the message packages of a ROS installation.
 
-    Raises
-    ------
-    ImportError
-        Where that package is not installed.
+    Raises ImportError where that package is not installed.
     """
     package, folder, short = name.split("/")
     try:

@@ -41,12 +41,8 @@ _LEAST_AREA = 1e-12
 class Primitive:
     """A solid that encloses a body; its pose is the body's.
 
-    Attributes
-    ----------
-    kind
-        BOX, CYLINDER (axis along the body's z) or SPHERE.
-    dimensions
-        As SolidPrimitive has them: box: full edges x y z; cylinder: height, radius; sphere: radius; metres.
+    ``kind``: BOX, CYLINDER (axis along the body's z) or SPHERE.  ``dimensions``: as SolidPrimitive has them: box: full
+    edges x y z; cylinder: height, radius; sphere: radius; metres.
     """
 
     kind: str
@@ -62,7 +58,7 @@ class Primitive:
 
 
 def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
-    """The box, cylinder or sphere of the least volume that encloses a body.
+    """Return the box, cylinder or sphere of the least volume that encloses a body.
 
     Boxes with two small exponents become boxes; cylinders (e1 small, e2 near 1, a1 near a2) become cylinders; balls
     become spheres; what is none of these mostly gets its bounding box.  Parameters and errors are those of
@@ -72,19 +68,10 @@ def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
 
 
 def enclosing_solids(size: np.ndarray, shape: np.ndarray) -> list[tuple[float, Primitive]]:
-    """The box, cylinder and sphere that enclose a body, each behind its volume in cubic metres.
+    """Return the box, cylinder and sphere that enclose a body, each behind its volume in cubic metres.
 
-    Parameters
-    ----------
-    size : (3,)
-        Half sizes, metres.
-    shape : (2,)
-        e1, e2.
-
-    Raises
-    ------
-    ValueError
-        If a half size is not positive or an exponent not in (0, 2].
+    ``size`` (3,): half sizes, metres.  ``shape`` (2,): e1, e2.  Raises ValueError if a half size is not positive or an
+    exponent not in (0, 2].
     """
     (a1, a2, a3), (e1, e2) = (known.tolist() for known in _checked(size, shape))
     radius = sqrt(_largest(a1**2, a2**2, e2))
@@ -97,17 +84,14 @@ def enclosing_solids(size: np.ndarray, shape: np.ndarray) -> list[tuple[float, P
 
 
 def primitives(superquadrics: SuperquadricArray) -> list[Primitive]:
-    """The enclosing primitive of each of n bodies; ValueError as :func:`primitive`."""
+    """Return the enclosing primitive of each of n bodies; ValueError as :func:`primitive`."""
     return [primitive(size, shape) for size, shape in zip(superquadrics.size, superquadrics.shape, strict=True)]
 
 
 def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """A mesh of vertices (k, 3) and faces (m, 3) of vertex indices, outwards.
+    """Return a mesh of vertices (k, 3) and faces (m, 3) of vertex indices, outwards.
 
-    Raises
-    ------
-    ValueError
-        If shapes or indices do not fit.
+    Raises ValueError if shapes or indices do not fit.
     """
     from geometry_msgs.msg import Point
     from shape_msgs.msg import Mesh, MeshTriangle
@@ -126,23 +110,15 @@ def enclosing_factor(
     shape: np.ndarray,
     taper: np.ndarray | tuple[float, float] = (0.0, 0.0),
 ) -> float:
-    """By how much a mesh of points on a body must grow about the centre to enclose it, at least 1.
+    """Return by how much a mesh of points on a body must grow about the centre to enclose it, at least 1.
 
     The plane of a face, n.p = d, has the body behind it when d reaches the support function h(n), the dual of the
     gauge; the factor is the largest h(n) / d.  Then every point of the body lies behind the face that its ray from the
     centre passes: the body is inside.  For a mesh of 16 x 16 points it is below 1.03.
 
-    Parameters
-    ----------
-    vertices, faces
-        (k, 3) in the body's own frame and (m, 3), outwards, around the origin.
-    size, shape, taper
-        (3,), (2,) and (2,) of the body, as in a message.
-
-    Raises
-    ------
-    ValueError
-        If the mesh is not around the origin with its faces outwards, or the body is none.
+    ``vertices``, ``faces``: (k, 3) in the body's own frame and (m, 3), outwards, around the origin.  ``size``,
+    ``shape``, ``taper``: (3,), (2,) and (2,) of the body, as in a message.  Raises ValueError if the mesh is not around
+    the origin with its faces outwards, or the body is none.
     """
     size, shape = _checked(size, shape)
     vertices, faces = _checked_mesh(vertices, faces)

@@ -94,28 +94,9 @@ _NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index(
 class SuperquadricArray(Columns):
     """n superquadrics, column by column; see the module for units and conventions.
 
-    Attributes
-    ----------
-    size : (n, 3) float32
-    shape : (n, 2) float32
-    translation : (n, 3) float32
-    rotation : (n, 4) float32
-    score, residual : (n,) float32
-    sigma_size : (n, 3) float32
-    id, status : (n,) uint32
-    label, seen, fused, reason : (n,) uint32
-        0 if not given.
-    sigma_shape : (n, 2) float32
-    sigma_centre, sigma_turn : (n, 3) float32
-        NaN if not given.
-    taper : (n, 2) float32
-        0 if not given.
-    objectness : (n,) float32
-        NaN if not given.
-    part : (n,) uint32
-        0 if not given.
-
-    Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
+    Numbers are float32 (n,) or (n, k), id, status, label, seen, fused, reason and part uint32 (n,).  Those with a
+    default are 0 if not given, deviations and objectness NaN.  Raises ValueError as
+    :class:`~sq_msgs_py.columns.Columns` does.
     """
 
     FIELDS = FIELDS
@@ -182,12 +163,9 @@ def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageType
 
 
 def from_message(message: PointCloud2) -> SuperquadricArray:
-    """The superquadrics of a message; fields are found by name, unknown ones are left aside.
+    """Return the superquadrics of a message; fields are found by name, unknown ones are left aside.
 
-    Raises
-    ------
-    MessageError
-        If a field is missing, has an unknown datatype, a count other than one or an offset outside the point, or if the
-        data is not as long as width, height and steps require.
+    Raises MessageError if a field is missing, has an unknown datatype, a count other than one or an offset outside the
+    point, or if the data is not as long as width, height and steps require.
     """
     return columns.from_message(SuperquadricArray, message, _NEEDED)

@@ -155,12 +155,8 @@ def replaced_input(
 ) -> str:
     """Complain if an output would replace an input; empty if none would.
 
-    Parameters
-    ----------
-    files
-        The files that are written, by the option that names each; None if it was not given.
-    folders
-        The folders that are written to, likewise, each with the suffix of the files there.
+    ``files``: the files that are written, by the option that names each; None if it was not given.  ``folders``: the
+    folders that are written to, likewise, each with the suffix of the files there.
     """
     for name, file in files.items():
         path = None if file is None or str(file) == STANDARD_OUTPUT else Path(file)

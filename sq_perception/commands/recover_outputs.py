@@ -87,21 +87,10 @@ def _decisive(options: argparse.Namespace) -> dict[str, Any]:
 class Outputs:
     """All outputs of a run, open before the first frame.
 
-    Attributes
-    ----------
-    done : list
-        Elements of ``frames`` that the file of lines had at the beginning.
-    results : list
-        Elements of ``frames`` that this run adds.
-    scene : list
-        Elements of ``scene``, to be set before the end.
-
-    Raises
-    ------
-    ValueError
-        For a name or kind of image that is none, or a file of lines that cannot be gone on with.
-    OSError, ImportError
-        If something cannot be written.
+    ``done``: elements of ``frames`` that the file of lines had at the beginning.  ``results``: elements of ``frames``
+    that this run adds.  ``scene``: elements of ``scene``, to be set before the end.  Raises ValueError for a name or
+    kind of image that is none, or a file of lines that cannot be gone on with; OSError or ImportError if something
+    cannot be written.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:

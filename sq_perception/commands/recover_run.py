@@ -131,19 +131,9 @@ def run(options: argparse.Namespace) -> int:
 class RecoverRun:
     """One run with these options of the command.
 
-    Attributes
-    ----------
-    outputs : Outputs
-        The outputs of the run.
-    is_whole : bool
-        Whether all frames were tried.
-
-    Raises
-    ------
-    FrameError, CheckpointError, OSError, ImportError
-        If something cannot be read or written, or is missing.
-    ValueError
-        If the options cannot be meant so.
+    ``outputs``: the outputs of the run.  ``is_whole``: whether all frames were tried.  Raises FrameError,
+    CheckpointError, OSError, ImportError if something cannot be read or written, or is missing; ValueError if the
+    options cannot be meant so.
     """
 
     def __init__(self, options: argparse.Namespace) -> None:

@@ -20,10 +20,7 @@ from pathlib import Path
 class OutputFile:
     """A result: write it to ``partial``, then :meth:`commit` or :meth:`discard` it, as a ``with`` block does.
 
-    Raises
-    ------
-    OSError
-        If the result could not be written, or another program is writing it; nothing is changed then.
+    Raises OSError if the result could not be written, or another program is writing it; nothing is changed then.
     """
 
     def __init__(self, path: str | Path) -> None:

@@ -32,7 +32,7 @@ def facts(command: str, file: str | Path = __file__) -> dict[str, Any]:
 
 
 def version(package: str) -> str | None:
-    """The version of a package; None where it is not installed."""
+    """Return the version of a package; None where it is not installed."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -40,7 +40,7 @@ def version(package: str) -> str | None:
 
 
 def commit(file: str | Path = __file__) -> str | None:
-    """The short hash of the checkout that a file belongs to; None for an installed package."""
+    """Return the short hash of the checkout that a file belongs to; None for an installed package."""
     # An installation may lie inside of some checkout without being part of it.
     if _git(file, "ls-files", "--error-unmatch", Path(file).name) is None:
         return None

@@ -41,10 +41,7 @@ class Shot:
 class DemoNode(Node):
     """Node that ends the process ``seconds`` after the first image that all of ``nodes`` have answered.
 
-    Attributes
-    ----------
-    shots : list of Shot
-        The images that all have answered.
+    ``shots``: the images that all have answered.
     """
 
     def __init__(self, name: str, nodes: tuple[str, ...], seconds: float) -> None:

@@ -100,17 +100,11 @@ def decode(
 ) -> Frame:
     """Decode a depth image message; raises ValueError for anything that prevents its processing.
 
-    Parameters
-    ----------
-    message
-        16UC1 or 32FC1, plain or compressed; mono8 or mono16, an image of the unit cube; or points, which determine the
-        camera.
-    calibration_of
-        Looks up the calibration; only called for a valid image, not for clouds.  None for images of the unit cube.
-    scale, kind
-        Units per metre, None: by the encoding; and whether the image holds "z" or "range".
-    view
-        The camera's optical frame and the pose, quaternion and translation, of the points in it; None: they are in it.
+    ``message``: 16UC1 or 32FC1, plain or compressed; mono8 or mono16, an image of the unit cube; or points, which
+    determine the camera.  ``calibration_of``: Looks up the calibration; only called for a valid image, not for clouds.
+    None for images of the unit cube.  ``scale``, ``kind``: units per metre, None: by the encoding; and whether the
+    image holds "z" or "range".  ``view``: the camera's optical frame and the pose, quaternion and translation, of the
+    points in it; None: they are in it.
     """
     if isinstance(message, PointCloud2):
         header, points = message.header, points_from_message(message) / np.float32(scale or 1.0)
@@ -151,12 +145,8 @@ def decode(
 def draw_masks(message: MaskMessage, size: tuple[int, int]) -> np.ndarray:
     """Draw the masks of a yolo_msgs/DetectionArray as a label image, int32 (height, width).
 
-    Label k is the k-th detection; where two overlap, the one with the higher score is on top.
-
-    Raises
-    ------
-    ValueError
-        If a detection has no mask, or one of an image that is not ``size``, (width, height), pixels.
+    Label k is the k-th detection; where two overlap, the one with the higher score is on top.  Raises ValueError if a
+    detection has no mask, or one of an image that is not ``size``, (width, height), pixels.
     """
     labels = np.zeros(size[::-1], np.int32)
     numbered = enumerate(message.detections, start=1)

@@ -69,11 +69,8 @@ class Outcome(NamedTuple):
 class FrameNode(ManagedNode):
     """Node for depth images; ``kind`` is its parameter dataclass, ``defaults`` override some of its defaults.
 
-    Raises
-    ------
-    ParameterError
-        For a parameter that cannot be used.  A model that is missing or wrong is a fault of the configuration, as it is
-        read there.
+    Raises ParameterError for a parameter that cannot be used.  A model that is missing or wrong is a fault of the
+    configuration, as it is read there.
     """
 
     def __init__(

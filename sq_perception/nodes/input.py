@@ -186,10 +186,7 @@ class Input:
     ) -> Frame:
         """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.
 
-        Raises
-        ------
-        ValueError
-            For anything that keeps it from being processed.
+        Raises ValueError for anything that keeps it from being processed.
         """
         message, use, source = arrival.message, parameters.use_masks, self._info
         frame = decode(

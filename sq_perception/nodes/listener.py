@@ -35,10 +35,7 @@ _RELIABILITIES = {
 class Listener:
     """A subscription whose ``statistics`` count lost messages.  Call :meth:`follow` each second.
 
-    Raises
-    ------
-    ValueError
-        For an override that is no reliability.
+    Raises ValueError for an override that is no reliability.
     """
 
     def __init__(

@@ -188,10 +188,7 @@ class OptionalOutputs:
     def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
         """Publish a frame on the outputs that are enabled and have subscribers.
 
-        Parameters
-        ----------
-        hidden
-            Ids of bodies that the frame does not show and that are not given up.
+        ``hidden``: ids of bodies that the frame does not show and that are not given up.
         """
         self.follow(parameters)
         has_frame = bool(found.header.frame_id)

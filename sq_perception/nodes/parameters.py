@@ -69,21 +69,11 @@ P = TypeVar("P", bound=Parameters)
 class LiveParameters(Generic[P]):
     """Parameters of a node, declared from the fields of a dataclass ``kind``, with their changes.
 
-    Parameters
-    ----------
-    locked
-        Returns why parameters that are not live cannot change now; empty if they can.  None: they never can.
-    check
-        Raises ValueError for an invalid set of values; also gets the names of those that change.
-    changed
-        Called with the new values and the names of those that were set.
-    defaults
-        Of this node, in place of the dataclass'.
-
-    Raises
-    ------
-    InvalidParameterValueException, ParameterError
-        If a value given at the start has a wrong type, is out of range, or does not fit the others.
+    ``locked``: returns why parameters that are not live cannot change now; empty if they can.  None: they never can.
+    ``check``: Raises ValueError for an invalid set of values; also gets the names of those that change.  ``changed``:
+    called with the new values and the names of those that were set.  ``defaults``: of this node, in place of the
+    dataclass'.  Raises InvalidParameterValueException or ParameterError if a value given at the start has a wrong type,
+    is out of range, or does not fit the others.
     """
 
     def __init__(

@@ -51,7 +51,7 @@ _PEEKED = 10
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a path looks like a recording, from the outside."""
+    """Return whether a path looks like a recording, from the outside."""
     path = Path(path)
     if not path.is_dir():
         return path.suffix.lower() in SUFFIXES
@@ -67,7 +67,7 @@ def is_bag(path: str | Path) -> bool:
 
 
 def frame_name(path: Path, stamp: Stamp) -> str:
-    """What the frame of a bag with this stamp is called."""
+    """Return what the frame of a bag with this stamp is called."""
     return f"{path.resolve().name if path.is_dir() else path.stem}_{stamp}"
 
 
@@ -75,27 +75,13 @@ def frame_name(path: Path, stamp: Stamp) -> str:
 class InputOptions:
     """What is read of files, folders and bags, and how.
 
-    Attributes
-    ----------
-    camera_info
-        Intrinsics of images and bags, as :func:`frame_file.read` takes them; go before what a folder or bag brings.
-    projection
-        "pinhole" or "orthographic", which looks for grey images of the unit cube in bags.
-    topic
-        Topic of the images in bags; needed where several show depth.
-    every, limit
-        Of each folder and bag: every n-th frame only, and at most so many.
-    distortion
-        Of images and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
-    reading
-        What is taken of each image; masks are files called as the frames are.
-    camera_info_topic
-        Topic of the camera in bags, where it is not beside the images'.
-
-    Raises
-    ------
-    ValueError
-        If ``every`` or ``limit`` is below 1.
+    ``camera_info``: Intrinsics of images and bags, as :func:`frame_file.read` takes them; go before what a folder or
+    bag brings.  ``projection``: "pinhole" or "orthographic", which looks for grey images of the unit cube in bags.
+    ``topic``: Topic of the images in bags; needed where several show depth.  ``every``, ``limit``: of each folder and
+    bag: every n-th frame only, and at most so many.  ``distortion``: of images and bags: "auto", "apply" or "ignore",
+    see :mod:`sq_perception.imaging.calibration`.  ``reading``: what is taken of each image; masks are files called as
+    the frames are.  ``camera_info_topic``: Topic of the camera in bags, where it is not beside the images'.  Raises
+    ValueError if ``every`` or ``limit`` is below 1.
     """
 
     camera_info: str | Path | None = None
@@ -118,19 +104,9 @@ class RecordedBag:
     A message that cannot be read comes as a FrameError with the reason, and the next one follows.  Close it, or use it
     as a context manager.
 
-    Parameters
-    ----------
-    path
-        The bag, a folder or file.
-    options
-        All of its images by default.
-    is_done
-        Called with the stamp of each image that counts; where it is true, the image is neither decoded nor given.
-
-    Raises
-    ------
-    FrameError
-        If the bag cannot be read, or has not exactly one topic to read; the message lists what it has.
+    ``path``: the bag, a folder or file.  ``options``: all of its images by default.  ``is_done``: called with the stamp
+    of each image that counts; where it is true, the image is neither decoded nor given.  Raises FrameError if the bag
+    cannot be read, or has not exactly one topic to read; the message lists what it has.
     """
 
     def __init__(
@@ -166,7 +142,7 @@ class RecordedBag:
         self._opened.close()
 
     def __len__(self) -> int:
-        """Images that will be read, as the bag counts them; a damaged bag may count wrong."""
+        """Return images that will be read, as the bag counts them; a damaged bag may count wrong."""
         count = sum(
             max(0, connection.msgcount) for connection in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
         )
@@ -184,7 +160,7 @@ class RecordedBag:
             yield error
 
     def _pair(self) -> Iterator[tuple[Message, Message | None] | FrameError]:
-        """The images in their order, each with its camera_info if one is needed and there is one."""
+        """Return the images in their order, each with its camera_info if one is needed and there is one."""
         needs_info = self._options.camera_info is None and not self._orthographic
         latest: Message | None = None
         waiting: Message | None = None
@@ -214,7 +190,7 @@ class RecordedBag:
     # topics
 
     def _choose(self, wanted: str | None) -> str:
-        """The topic that was asked for, or the one that shows depth."""
+        """Return the topic that was asked for, or the one that shows depth."""
         images = sorted({connection.topic for connection in self._reader.connections(IMAGE, COMPRESSED)})
         encodings: dict[str, str | None] = {}
         damage: FrameError | None = None
@@ -243,14 +219,14 @@ class RecordedBag:
         return found[0]
 
     def _encoding(self, topic: str) -> str | None:
-        """The encoding of the first readable image of a topic; None where none of the first ones can be read."""
+        """Return the encoding of the first readable image of a topic; None where none of the first ones can be read."""
         message = next(self._first_images(topic), None)
         if message is not None and message.kind == COMPRESSED:
             return compressed_depth.encoding(message.content.format) or str(message.content.format)
         return None if message is None else str(message.content.encoding)
 
     def _first_images(self, topic: str) -> Iterator[Message]:
-        """The readable ones of the first images of a topic."""
+        """Return the readable ones of the first images of a topic."""
         found = islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED)
         return (message for message in found if isinstance(message, Message))
 
@@ -264,7 +240,7 @@ class RecordedBag:
             yield from reader.messages(reader.connections(IMAGE, topic=self._mask_topics[0]), received=received)
 
     def _mask(self, stamp: Stamp) -> Message | None:
-        """The first mask with this stamp, wherever it is: a segmentation may answer its images in another order.
+        """Return the first mask with this stamp, wherever it is: a segmentation may answer its images in another order.
 
         None for an image without a stamp, as a node has it.  Raises ValueError where there is none, and one that cannot
         be read might be it.
@@ -287,7 +263,7 @@ class RecordedBag:
             return next(found, None)
 
     def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
-        """The masks of an image: from files if there is a folder of them, else from the bag."""
+        """Return the masks of an image: from files if there is a folder of them, else from the bag."""
         labels = self._options.reading.labels(name, image)
         if labels is not None or self._options.reading.ignore_masks:
             return labels
@@ -300,7 +276,7 @@ class RecordedBag:
         return labels
 
     def _frame(self, message: Message, info: Message | None) -> Iterator[RecordedFrame | FrameError]:
-        """The frame of an image, unless it is done."""
+        """Return the frame of an image, unless it is done."""
         if self._is_done(message.stamp):
             return
         try:

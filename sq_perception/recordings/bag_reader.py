@@ -44,23 +44,20 @@ class InfoTopic:
 
 
 def raw_topic(topic: str) -> str:
-    """The topic that shows the images of a compressedDepth topic as they are; any other topic itself."""
+    """Return the topic that shows the images of a compressedDepth topic as they are; any other topic itself."""
     return topic.removesuffix(f"/{compressed_depth.TRANSPORT}")
 
 
 def camera_info_topic(topic: str) -> str:
-    """The camera_info topic of an image topic: the one in its name space."""
+    """Return the camera_info topic of an image topic: the one in its name space."""
     space, slash, _ = raw_topic(topic).rpartition("/")
     return f"{space}{slash}camera_info"
 
 
 def info_topic(reader: BagReader, topic: str, image: Message | None, wanted: str | None) -> InfoTopic:
-    """The camera_info topic for the images of a topic, of which one is given, or the one that was asked for.
+    """Return the camera_info topic for the images of a topic, of which one is given, or the one that was asked for.
 
-    Raises
-    ------
-    FrameError
-        If the bag has not the one that was asked for.
+    Raises FrameError if the bag has not the one that was asked for.
     """
     names = sorted({connection.topic for connection in reader.connections(CAMERA_INFO)})
     listed = ", ".join(names) or "none"
@@ -123,7 +120,7 @@ class BagReader:
     def messages(
         self, connections: list[Any], every: int = 1, limit: int | None = None, received: int | None = None
     ) -> Iterator[Message | FrameError]:
-        """Messages in the order they were recorded; of images every n-th, at most ``limit``.
+        """Return messages in the order they were recorded; of images every n-th, at most ``limit``.
 
         ``received``: only those of this time, nanoseconds.
         """
@@ -203,7 +200,7 @@ def _refuse_packed_files(folder: Path) -> None:
 
 
 def _plain(data: bytes) -> bytes:
-    """A message's bytes, unpacked where it was packed by itself."""
+    """Return a message's bytes, unpacked where it was packed by itself."""
     return _unpack(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
 
 
@@ -232,6 +229,6 @@ def _bound(decompressor: Any, data: bytes, size: int) -> bytes:
 
 
 def describe(error: Exception) -> str:
-    """An error's message in one line, with its kind where that alone is informative."""
+    """Return an error's message in one line, with its kind where that alone is informative."""
     text = " ".join(str(error).split())[:300]
     return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}".rstrip(": ")

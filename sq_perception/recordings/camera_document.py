@@ -30,12 +30,9 @@ _COLMAP_PARAMETERS = {
 
 
 def read(path: Path) -> Any:
-    """The document: a mapping if it is of a known form.
+    """Return the document: a mapping if it is of a known form.
 
-    Raises
-    ------
-    ValueError
-        If the file is missing, too large, or damaged.
+    Raises ValueError if the file is missing, too large, or damaged.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -79,7 +76,7 @@ def _of_numbers(text: str) -> dict[str, Any] | None:
 
 
 def _matrix(numbers: np.ndarray) -> dict[str, Any]:
-    """K, or the larger matrix around it, or four numbers."""
+    """Return K, or the larger matrix around it, or four numbers."""
     shape = _SHAPES.get(numbers.size)
     if shape is None or numbers.dtype.kind not in "fiu" or numbers.shape not in (shape, (numbers.size,)):
         raise ValueError(f"expected four numbers (fx fy cx cy) or 3 x 3 of them, got {numbers.dtype} {numbers.shape}")

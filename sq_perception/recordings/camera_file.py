@@ -122,18 +122,15 @@ class CameraInfo:
 def read_calibration(
     source: str | Path, distortion: Treatment = "auto", name: str = "", size: tuple[int, int] | None = None
 ) -> Calibration:
-    """The calibration of images called ``name``, as :func:`read_camera_info` has it.
+    """Return the calibration of images called ``name``, as :func:`read_camera_info` has it.
 
-    Raises
-    ------
-    FrameError
-        As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
+    Raises FrameError as :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
     """
     return calibration(read_camera_info(source, size), source, distortion, name)
 
 
 def calibration(info: CameraInfo, source: str | Path, distortion: Treatment, name: str) -> Calibration:
-    """The calibration of images called ``name``; a FrameError names the ``source`` of the camera_info."""
+    """Return the calibration of images called ``name``; a FrameError names the ``source`` of the camera_info."""
     try:
         return Calibration.of(info, name, distortion)
     except ValueError as error:
@@ -141,21 +138,12 @@ def calibration(info: CameraInfo, source: str | Path, distortion: Treatment, nam
 
 
 def read_camera_info(source: str | Path, size: tuple[int, int] | None = None, name: str | None = None) -> CameraInfo:
-    """The camera of a file, or of four numbers; see the module.
+    """Return the camera of a file, or of four numbers; see the module.
 
     A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
 
-    Parameters
-    ----------
-    source
-    size
-        Width and height of the images, where nothing states them.
-    name
-        Of the image without suffix: its number tells which of a scene's cameras it has.  None: any image's will do.
-
-    Raises
-    ------
-    FrameError
+    ``size``: width and height of the images, where nothing states them.  ``name``: of the image without
+    suffix: its number tells which of a scene's cameras it has.  None: any image's will do.
     """
     try:
         if not os.path.exists(source) and (numbers := _numbers(str(source))) is not None:
@@ -182,12 +170,12 @@ def camera_beside(path: Path) -> Path | None:
 
 
 def camera_in(folder: Path) -> Path | None:
-    """The camera of a folder's images."""
+    """Return the camera of a folder's images."""
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
 
 
 def _numbers(text: str) -> list[float] | None:
-    """The numbers of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
+    """Return the numbers of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
     try:
         return [float(word) for word in text.split(",")] if "," in text else None
     except ValueError:
@@ -208,7 +196,7 @@ class _Found:
 
 
 def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> CameraInfo:
-    """The camera of a document that is meant: of the image's number and size, and of depth."""
+    """Return the camera of a document that is meant: of the image's number and size, and of depth."""
     if not isinstance(document, dict | list):
         raise FrameError("expected a camera_info as a YAML mapping, JSON, or 3 x 3 numbers")
     found = list(_cameras(document))
@@ -236,7 +224,7 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
 
 
 def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None) -> Iterator[_Found]:
-    """Everything in a document that has a field of a camera."""
+    """Return everything in a document that has a field of a camera."""
     left = [_MOST_NODES] if left is None else left
     left[0] -= 1
     if left[0] < 0:
@@ -341,7 +329,7 @@ def _sides(one: _Found, size: tuple[int, int] | None) -> tuple[int, int] | None:
 
 
 def _matrix(one: _Found) -> np.ndarray:
-    """K, flat, row by row; zeros where only a projection matrix is given."""
+    """Return K, flat, row by row; zeros where only a projection matrix is given."""
     fields = one.fields
     if fields.keys() >= {_CX, _CY} and (fields.keys() >= {_FX, _FY} or "f" in fields):
         fx, fy = (_number(one, name if name in fields else "f") for name in (_FX, _FY))
@@ -368,7 +356,7 @@ def _matrix(one: _Found) -> np.ndarray:
 
 
 def _lens(one: _Found) -> str:
-    """The distortion model of a camera, by the name that messages have for it."""
+    """Return the distortion model of a camera, by the name that messages have for it."""
     for field in (_LENS, _MODEL):
         given = one.get(field)
         if given is None:
@@ -389,7 +377,7 @@ def _number(one: _Found, field: str) -> float:
 
 
 def _numbers_of(one: _Found, field: str, lengths: tuple[int, ...] | None) -> np.ndarray:
-    """The finite numbers of a field, flat; none where it is not there."""
+    """Return the finite numbers of a field, flat; none where it is not there."""
     if field not in one.fields:
         return np.zeros(0)
     name, values = one.fields[field]

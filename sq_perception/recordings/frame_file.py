@@ -111,6 +111,9 @@ class RecordedFrame:
 class Reading:
     """What is taken of an image, whatever it comes from.
 
+    Raises ValueError for a scale or depth that is not positive, limits that leave nothing, an empty region, or another
+    kind.
+
     Attributes
     ----------
     scale : float or None
@@ -127,11 +130,6 @@ class Reading:
         "z", or "range" for images of distances to the camera's centre.
     frame : CloudFrame or None
         Where the camera is in the frame of clouds; None: in their origin, and looks along z.
-
-    Raises
-    ------
-    ValueError
-        For a scale or depth that is not positive, limits that leave nothing, an empty region, or another kind.
     """
 
     scale: float | None = None
@@ -160,12 +158,9 @@ class Reading:
         return depth_units.z_from_range(depth, camera) if self.kind == "range" else depth
 
     def labels(self, name: str, like: np.ndarray) -> np.ndarray | None:
-        """The label image (height, width) of a frame, int32; None without a folder of them.
+        """Return the label image (height, width) of a frame, int32; None without a folder of them.
 
-        Raises
-        ------
-        FrameError
-            If it is missing, unreadable, or not of the size of the image ``like``.
+        Raises FrameError if it is missing, unreadable, or not of the size of the image ``like``.
         """
         if self.masks is None or self.ignore_masks:
             return None
@@ -180,12 +175,9 @@ class Reading:
         return labels
 
     def of(self, frame: RecordedFrame) -> RecordedFrame:
-        """The frame within the limits, with a warning where it seems to be another kind of image.
+        """Return the frame within the limits, with a warning where it seems to be another kind of image.
 
-        Raises
-        ------
-        FrameError
-            If the region is not within the image.
+        Raises FrameError if the region is not within the image.
         """
         frame = replace(frame, warning="; ".join(filter(None, (frame.warning, _likely_mistake(frame)))))
         if self == Reading():
@@ -214,6 +206,8 @@ def read(
 ) -> RecordedFrame:
     """Read one frame.
 
+    Raises FrameError for anything wrong with a file; ValueError for an unknown projection or treatment of distortion.
+
     Parameters
     ----------
     path
@@ -228,13 +222,6 @@ def read(
         names of the file and its folder.
     reading
         What is taken of the image; all of it by default.
-
-    Raises
-    ------
-    FrameError
-        For anything wrong with a file.
-    ValueError
-        For an unknown projection or treatment of distortion.
     """
     if projection not in get_args(Projection):
         raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {projection!r}")
@@ -255,7 +242,7 @@ def read(
 def _read(
     path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment, reading: Reading
 ) -> RecordedFrame:
-    """The frame; a ValueError that is no FrameError is about the file."""
+    """Return the frame; a ValueError that is no FrameError is about the file."""
     suffix = path.suffix.lower()
     if suffix in cloud_file.SUFFIXES:
         return _read_cloud(path, reading)
@@ -276,7 +263,7 @@ def _read(
 
 
 def _image(path: Path) -> np.ndarray:
-    """The pixels (height, width) of an image file, in the units and of the type that it has them."""
+    """Return the pixels (height, width) of an image file, in the units and of the type that it has them."""
     image = {".npy": npy_array, ".exr": exr_image}.get(path.suffix.lower(), grey_image)(path)
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):  # of one channel, as programs for networks have it
@@ -289,7 +276,7 @@ def _image(path: Path) -> np.ndarray:
 def _of_pinhole(
     path: Path, image: np.ndarray, camera_info: str | Path | None, distortion: Treatment, reading: Reading
 ) -> RecordedFrame:
-    """The frame of a pinhole camera's image, which is rectified."""
+    """Return the frame of a pinhole camera's image, which is rectified."""
     camera_info = camera_info or camera_beside(path)
     if camera_info is None:
         raise ValueError("a depth image needs a camera_info with the camera's intrinsics, a file or fx,fy,cx,cy")
@@ -320,7 +307,7 @@ def _metres(image: np.ndarray, reading: Reading, known: Stated | None) -> Metres
 
 
 def stamp_of(path: Path) -> Stamp | None:
-    """The time in a name, seconds and their fraction."""
+    """Return the time in a name, seconds and their fraction."""
     parts = _TIME.fullmatch(path.stem)
     return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None
 
@@ -354,7 +341,7 @@ def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
 
 
 def _likely_mistake(frame: RecordedFrame) -> str:
-    """What an image that no depth camera takes seems to be; empty for others."""
+    """Return what an image that no depth camera takes seems to be; empty for others."""
     if not frame.is_cube:
         return depth_units.wrong_unit(frame.depth)
     shown = frame.depth[::4, ::4]

@@ -67,7 +67,7 @@ class HtmlPage:
 
 
 def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
-    """What the page draws of a frame, and from where it looks at it."""
+    """Return what the page draws of a frame, and from where it looks at it."""
     camera, depth = frame.camera, frame.depth
     stride = max(1, math.ceil(math.sqrt(depth.size / _MOST_POINTS)))
     rows, columns = np.nonzero(np.isfinite(depth[::stride, ::stride]))
@@ -118,12 +118,12 @@ def _body(number: int, body: Superquadric, sigma_size: np.ndarray, up: np.ndarra
 
 
 def _pack(values: np.ndarray) -> str:
-    """Numbers as base64 of unsigned 16 bit, little endian."""
+    """Return numbers as base64 of unsigned 16 bit, little endian."""
     return base64.b64encode(values.astype("<u2").tobytes()).decode()
 
 
 def _numbers(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
-    """The bodies as rows of text, and what is to be said of the frame."""
+    """Return the bodies as rows of text, and what is to be said of the frame."""
     rows = []
     for body in recovery.bodies:
         shown = in_result_frame(body.superquadric, frame.is_cube)

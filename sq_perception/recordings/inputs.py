@@ -36,20 +36,9 @@ _DIGITS = re.compile(r"(\d+)")
 class RecordedInput:
     """Frames of the named files, folders and bags; iterating gives pairs of where each came from and what it is.
 
-    Parameters
-    ----------
-    names
-        As the user gave them.
-    options
-        All of their images by default.
-    is_done
-        Called with file, topic and stamp of each frame that counts; where it is true, the frame is neither read nor
-        given.
-
-    Raises
-    ------
-    FrameError
-        If there is something wrong with the camera_info.
+    ``names``: as the user gave them.  ``options``: all of their images by default.  ``is_done``: called with file,
+    topic and stamp of each frame that counts; where it is true, the frame is neither read nor given.  Raises FrameError
+    if there is something wrong with the camera_info.
     """
 
     def __init__(
@@ -140,7 +129,7 @@ class RecordedInput:
 
 
 def in_folder(folder: Path) -> list[Path]:
-    """The frames and bags in a folder: by their times where all names are times, else in natural order."""
+    """Return the frames and bags in a folder: by their times where all names are times, else in natural order."""
 
     def is_frame(path: Path) -> bool:
         return path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir()  # a broken link is reported
@@ -152,6 +141,6 @@ def in_folder(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Numbers in a name count as numbers: every second part is one."""
+    """Return numbers in a name count as numbers: every second part is one."""
     parts = _DIGITS.split(path.name.lower())
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name

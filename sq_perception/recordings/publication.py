@@ -56,16 +56,10 @@ Mesh = tuple[np.ndarray, np.ndarray]
 class Identified:
     """The objects of a frame as they are published.
 
-    Attributes
-    ----------
-    ids
-        The id of each object.
-    hidden
-        Ids of tracks that the frame does not show.
-    columns
-        What a message says of each object besides, by its column: ``seen``, frames that showed it so far; ``fused``,
-        whether its numbers are those of its track; ``reason``, :class:`~sq_msgs_py.superquadrics.Reason` by the frame's
-        fit and the axes that are published.
+    ``ids``: the id of each object.  ``hidden``: ids of tracks that the frame does not show.  ``columns``: what a
+    message says of each object besides, by its column: ``seen``, frames that showed it so far; ``fused``, whether its
+    numbers are those of its track; ``reason``, :class:`~sq_msgs_py.superquadrics.Reason` by the frame's fit and the
+    axes that are published.
     """
 
     recovery: FrameRecovery
@@ -94,7 +88,7 @@ class Identified:
 def identify(
     recovery: FrameRecovery, tracks: Sequence[Followed] | None = None, hidden: tuple[int, ...] = ()
 ) -> Identified:
-    """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order.
+    """Return bodies and ids of their tracks, of which there is one for each body that did not fail, in their order.
 
     Without tracks bodies are the frame's, and ids their labels.
     """
@@ -119,7 +113,7 @@ def identify(
 
 
 def _reason(body: Recovery, shown: Superquadric) -> int:
-    """The reason that a fit gives for its status, by the axes of the body that is shown in its place."""
+    """Return the reason that a fit gives for its status, by the axes of the body that is shown in its place."""
     fit = body.fit
     reason = (Reason.HULL if fit.as_hull else Reason(0)) | (Reason(0) if body.cavity is None else Reason.CAVITY)
     if fit.status == Status.WEAK:
@@ -134,18 +128,10 @@ def _reason(body: Recovery, shown: Superquadric) -> int:
 class Findings:
     """What one image showed, as every output but the rendered depth is made of it.
 
-    Attributes
-    ----------
-    array
-        Every object, failed ones included.
-    parts
-        The parts of those that have some; ids are shared.
-    covariances : (n, 6, 6)
-        Of the objects' poses, as in :mod:`sq_msgs_py.poses`; NaN where unknown.
-    header
-        std_msgs/Header: the stamp of the image, and the frame that all this is in.
-    plane : (4,) or None
-        The support plane, height above it = n.p + d.
+    ``array``: every object, failed ones included.  ``parts``: the parts of those that have some; ids are shared.
+    ``covariances`` (n, 6, 6): of the objects' poses, as in :mod:`sq_msgs_py.poses`; NaN where unknown.  ``header``:
+    std_msgs/Header: the stamp of the image, and the frame that all this is in.  ``plane`` (4,) or None: the support
+    plane, height above it = n.p + d.
     """
 
     array: SuperquadricArray
@@ -171,7 +157,7 @@ class Findings:
         return tuple(triangles(body, MARKER_RESOLUTION) for body in _in_own_frames(shown))
 
     def move(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
-        """The same in another frame, p_new = R(rotation) p + translation; the stamp stays."""
+        """Return the same in another frame, p_new = R(rotation) p + translation; the stamp stays."""
         return Findings(
             array=poses.move(self.array, rotation, translation),
             covariances=poses.turn_covariances(self.covariances, rotation),
@@ -191,7 +177,7 @@ class Findings:
 
 
 def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
-    """What a frame showed, in the frame of its image, whose header it is."""
+    """Return what a frame showed, in the frame of its image, whose header it is."""
     recovery = found.recovery
     array = superquadric_array(found, is_cube)
     covariances = np.array([body.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN] for body in recovery.bodies])
@@ -242,13 +228,13 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
 
 
 def superquadrics(array: SuperquadricArray) -> Superquadric:
-    """The bodies (n,) of a message, in its frame."""
+    """Return the bodies (n,) of a message, in its frame."""
     bodies = Superquadric(**{name: getattr(array, name).astype(float) for name in _OF_A_BODY})
     return bodies.with_taper(np.asarray(array.taper, float))
 
 
 def _in_own_frames(array: SuperquadricArray) -> Superquadric:
-    """The bodies (n,) of a message, each in its own frame."""
+    """Return the bodies (n,) of a message, each in its own frame."""
     return Superquadric.at_origin(array.size, array.shape).with_taper(np.asarray(array.taper, float))
 
 
@@ -280,7 +266,7 @@ def covariances(array: SuperquadricArray) -> np.ndarray:
 
 
 def truth_array(bodies: Superquadric) -> SuperquadricArray:
-    """A batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
+    """Return a batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
     count = len(bodies)
     return SuperquadricArray(
         **{name: getattr(bodies, name) for name in _OF_A_BODY},
@@ -297,7 +283,7 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
 
 
 def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = installed) -> Any:
-    """An Image of depth (height, width) in metres, NaN or inf for nothing; mono8 and mono16: of the cube."""
+    """Return an Image of depth (height, width) in metres, NaN or inf for nothing; mono8 and mono16: of the cube."""
     if encoding in _GREY_TYPES:
         return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
     return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), header, encoding, types)
@@ -306,20 +292,11 @@ def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageT
 def depth_of(
     message: Any, is_cube: bool, scale: float | None = None, known: Stated | None = None
 ) -> tuple[Metres, str]:
-    """Depth of an image message, and its encoding before it was packed.
+    """Return depth of an image message, and its encoding before it was packed.
 
-    Parameters
-    ----------
-    message
-        sensor_msgs/Image of 16UC1 or 32FC1, or CompressedImage of the compressedDepth transport; if ``is_cube`` Image
-        of mono8 or mono16, grey values of the unit cube.
-    scale, known
-        Units, as :func:`depth_units.metres` takes them.
-
-    Raises
-    ------
-    ValueError
-        For anything else.
+    ``message``: sensor_msgs/Image of 16UC1 or 32FC1, or CompressedImage of the compressedDepth transport; if
+    ``is_cube`` Image of mono8 or mono16, grey values of the unit cube.  ``scale``, ``known``: units, as
+    :func:`depth_units.metres` takes them.  Raises ValueError for anything else.
     """
     if is_cube:
         return Metres(unit_cube.depth_from_grey(grey_from_message(message))), str(message.encoding)

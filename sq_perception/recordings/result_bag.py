@@ -72,19 +72,9 @@ _STORE: Any = get_typestore(Stores.ROS2_JAZZY)
 class ResultBag:
     """A bag that takes one frame after the other; close it, or use it as a context manager.
 
-    Parameters
-    ----------
-    path
-        A name that ends in SUFFIX; a file that is there is replaced when this one is whole.
-    images
-        Which images to write beside the results.
-
-    Raises
-    ------
-    OSError
-        If the file cannot be written; the message names what became of it.
-    ValueError
-        For a wrong path or kind of image.
+    ``path``: a name that ends in SUFFIX; a file that is there is replaced when this one is whole.  ``images``: which
+    images to write beside the results.  Raises OSError if the file cannot be written; the message names what became of
+    it; ValueError for a wrong path or kind of image.
     """
 
     def __init__(self, path: str | Path, images: Sequence[BagImage] = ("depth",)) -> None:
@@ -114,17 +104,9 @@ class ResultBag:
     def add(self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None) -> None:
         """Write a frame and what was recovered from it.
 
-        Parameters
-        ----------
-        tracks
-            Of each body that did not fail, in their order; None if bodies are not tracked.
-
-        Raises
-        ------
-        FrameError
-            If a name in the recording is too long to be one.
-        OSError
-            If the disk is full; the file is then closed with what there is.
+        ``tracks``: of each body that did not fail, in their order; None if bodies are not tracked.  Raises FrameError
+        if a name in the recording is too long to be one; OSError if the disk is full; the file is then closed with what
+        there is.
         """
         found = publication.identify(recovery, tracks)
         stamp = self._stamp(frame)

@@ -43,7 +43,7 @@ class ResumeError(ValueError):
 
 
 def head(options: Mapping[str, Any]) -> dict[str, Any]:
-    """What both forms begin with; ``options`` are those that decide what is found."""
+    """Return what both forms begin with; ``options`` are those that decide what is found."""
     program = f"sq_perception {__version__}"
     plain = {name: plain_name(value) if isinstance(value, str) else value for name, value in options.items()}
     return {"format": FORMAT, "version": VERSION, "program": program, "units": UNITS, "options": plain}
@@ -52,7 +52,7 @@ def head(options: Mapping[str, Any]) -> dict[str, Any]:
 def frame_entry(
     file: str, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None
 ) -> dict[str, Any]:
-    """The element of ``frames``; ``tracks`` are those of the bodies that did not fail, None without tracking."""
+    """Return the element of ``frames``; ``tracks`` are those of the bodies that did not fail, None without tracking."""
     bodies, left = [], iter(tracks or ())
     for body in recovery.bodies:
         track = None if body.status == Status.FAILED else next(left, None)
@@ -100,7 +100,7 @@ def frame_entry(
 
 
 def plain_name(file: str) -> str:
-    r"""The name of a file as text that every program reads: ``\xe9`` for a byte that is no UTF-8."""
+    r"""Return the name of a file as text that every program reads: ``\xe9`` for a byte that is no UTF-8."""
     return file.encode(errors="surrogateescape").decode(errors="backslashreplace")
 
 
@@ -134,7 +134,7 @@ def _part_entries(parts: Parts | None, is_cube: bool) -> list[dict[str, Any]]:
 
 
 def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
-    """A body in the coordinates that results are given in."""
+    """Return a body in the coordinates that results are given in."""
     return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
 
 
@@ -144,7 +144,7 @@ def _parameters(body: Superquadric) -> dict[str, Any]:
 
 
 def scene_entry(track: Track) -> dict[str, Any]:
-    """The element of ``scene``: a body of the world of the camera poses."""
+    """Return the element of ``scene``: a body of the world of the camera poses."""
     weak = undetermined(track.covariance, track.superquadric.size).any()
     numbers = {**_parameters(track.superquadric), "sigma_size": track.sigma_size}
     values = {name: value.tolist() for name, value in numbers.items()}
@@ -154,13 +154,13 @@ def scene_entry(track: Track) -> dict[str, Any]:
 def document(
     options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], scene: Sequence[Mapping[str, Any]] = ()
 ) -> str:
-    """The whole document, with ``scene`` where there is one."""
+    """Return the whole document, with ``scene`` where there is one."""
     whole = {**head(options), "frames": frames, **({"scene": scene} if scene else {})}
     return json.dumps(whole, indent=1, allow_nan=False) + "\n"
 
 
 def table(frames: Sequence[Mapping[str, Any]]) -> str:
-    """Bodies, each before its parts, as CSV, a row each under a line of names; empty where unknown."""
+    """Return bodies, each before its parts, as CSV, a row each under a line of names; empty where unknown."""
     axes = ("1", "2", "3")
     columns = {
         "size": [f"a{k}" for k in axes],
@@ -191,13 +191,8 @@ class ResultLines:
     """A file of JSON lines that grows frame by frame; close it when all is done.  A stream is written to as it is.
 
     ``options`` are those that decide what is found; ``done`` has the elements of ``frames`` that were there before.
-
-    Raises
-    ------
-    ResumeError
-        If there is a file of something else, or of other options.
-    OSError
-        If it cannot be written, or another program is writing it.
+    Raises ResumeError if there is a file of something else, or of other options; OSError if it cannot be written, or
+    another program is writing it.
     """
 
     def __init__(self, path: str | Path, options: Mapping[str, Any]) -> None:
@@ -277,7 +272,7 @@ class Recovered:
         self._left.update(_key(entry["file"], entry.get("topic"), entry.get("stamp")) for entry in entries)
 
     def __call__(self, file: str, topic: str, stamp: Stamp | None) -> bool:
-        """Whether this frame is one of them; it is then ticked off."""
+        """Return whether this frame is one of them; it is then ticked off."""
         key = _key(plain_name(file), topic, None if stamp is None else stamp._asdict())
         found = self._left[key] > 0
         if found:
@@ -286,7 +281,7 @@ class Recovered:
 
 
 def _is_head(found: Mapping[str, Any], expected: Mapping[str, Any]) -> bool:
-    """Whether it is the first line of a file of lines, and no document, which has frames too."""
+    """Return whether it is the first line of a file of lines, and no document, which has frames too."""
     return found.keys() == expected.keys() and all(found[name] == expected[name] for name in ("format", "version"))
 
 

@@ -55,15 +55,11 @@ class Solid:
 
 
 def inflate(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Superquadric:
-    """Bodies (n,) whose faces lie ``sigmas`` standard deviations farther out, by their covariances (n, 11, 11).
+    """Return bodies (n,) whose faces lie ``sigmas`` standard deviations farther out, by their covariances (n, 11, 11).
 
     A face moves with the size and with the centre, whose errors belong together: each half size grows by the larger
-    deviation of its two faces.  Deviations of rotations are not looked at.
-
-    Raises
-    ------
-    ValueError
-        For negative ``sigmas``, or a covariance that is not known: its body would not grow at all.
+    deviation of its two faces.  Deviations of rotations are not looked at.  Raises ValueError for negative ``sigmas``,
+    or a covariance that is not known: its body would not grow at all.
     """
     if not sigmas >= 0:
         raise ValueError(f"sigmas: expected a number from 0, got {sigmas}")
@@ -82,10 +78,7 @@ def inflate(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Sup
 def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = None, meshes: bool = False) -> list[Solid]:
     """What encloses each of n bodies, in a format's kinds of solids; ``names`` are body_0, body_1 ... if not given.
 
-    Raises
-    ------
-    ValueError
-        For a format that is none, or names that are not one a body and different.
+    Raises ValueError for a format that is none, or names that are not one a body and different.
     """
     if form not in SUFFIXES:
         raise ValueError(f"format: expected one of {', '.join(SUFFIXES)}, got {form!r}")

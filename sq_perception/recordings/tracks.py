@@ -31,12 +31,7 @@ Pose = tuple[np.ndarray, np.ndarray]
 class CameraPoses:
     """The poses of a file.
 
-    Raises
-    ------
-    OSError
-        If it cannot be read.
-    ValueError
-        If it is no such file; the message has the line.
+    Raises OSError if it cannot be read; ValueError if it is no such file; the message has the line.
     """
 
     def __init__(self, path: Path) -> None:
@@ -56,7 +51,7 @@ class CameraPoses:
                 raise ValueError(f"{path}: line {number}: {name} has a pose already")
 
     def of(self, file: str, frame: RecordedFrame) -> Pose:
-        """The pose of a frame of this source; a FrameError if the file has none."""
+        """Return the pose of a frame of this source; a FrameError if the file has none."""
         path = Path(file)
         names = [file, path.name, path.stem, frame.topic]
         names += [] if frame.stamp is None else [str(frame.stamp.sec + 1e-9 * frame.stamp.nanosec)]
@@ -67,7 +62,7 @@ class CameraPoses:
 
 
 def _key(name: str) -> str:
-    """The name, of a number to the millisecond."""
+    """Return the name, of a number to the millisecond."""
     try:
         return f"{float(name):.3f}"
     except ValueError:
@@ -94,7 +89,7 @@ class RecordedTracks:
         self._warned = False
 
     def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> tuple[Followed, ...]:
-        """Each body that did not fail, in their order, as its track knows it; ``file`` is the frame's source.
+        """Return each body that did not fail, in their order, as its track knows it; ``file`` is the frame's source.
 
         Raises FrameError for a frame without a pose, where there are poses.
         """
