@@ -31,10 +31,6 @@ from sq_perception.recovery.recoverer import Recoverer, Recovery
 
 FORMAT, VERSION = "sq_perception.grasps", 1
 _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score", "weakest")
-_SHARP = 0.02
-"""Exponents of a gripper's boxes in a mesh."""
-_LONGEST = 10.0
-"""Largest aspect ratio of a picture."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -141,17 +137,12 @@ def _bodies(
 
 
 def _draw(
-    path: Path,
-    frame: RecordedFrame,
-    found: Sequence[Recovery],
-    numbers: Sequence[int],
-    plan: GraspPlan,
-    hand: Gripper,
+    path: Path, frame: RecordedFrame, found: Sequence[Recovery], numbers: Sequence[int], plan: GraspPlan, hand: Gripper
 ) -> None:
     from sq_perception.evaluation import plots
 
     # Of an image of few columns the picture would have more pixels than fit into memory, of one of few rows none.
-    form = min(max(frame.camera.height / frame.camera.width, 1 / _LONGEST), _LONGEST)
+    form = min(max(frame.camera.height / frame.camera.width, 0.1), 10.0)
     figure = plots.new_figure(9.6, 9.6 * form)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     bodies = [recovered.superquadric for recovered in found]
@@ -169,7 +160,7 @@ def _write_mesh(path: Path, found: Sequence[Recovery], numbers: Sequence[int], p
             boxes = hand.boxes(grasp.opening, reach=0.0)
             for name, box in zip(("left", "right", "hand"), boxes, strict=True):
                 centre = grasp.to_body_frame(box[None, :3])[0]
-                solids.append(Superquadric(box[3:], np.full(2, _SHARP), centre, grasp.rotation))
+                solids.append(Superquadric(box[3:], np.full(2, 0.02), centre, grasp.rotation))
                 names.append(f"grasp_{k}_{name}")
                 owner.append(k)
     with output_file.writing(path) as partial:

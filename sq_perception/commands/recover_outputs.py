@@ -32,28 +32,8 @@ if TYPE_CHECKING:
 
 _FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
-    "projection",
-    "method",
-    "camera_info",
-    "camera_info_topic",
-    "depth_scale",
-    "depth_kind",
-    "depth_min",
-    "depth_max",
-    "roi",
-    "masks",
-    "min_score",
-    "max_size",
-    "workspace",
-    "distortion",
-    "topic",
-    "model",
-    "ignore_masks",
-    "track",
-    "poses",
-    "time_budget",
-    "max_objects",
-    "parts",
+    "projection method camera_info camera_info_topic depth_scale depth_kind depth_min depth_max roi masks min_score "
+    "max_size workspace distortion topic model ignore_masks track poses time_budget max_objects parts"
 )
 """Options that affect the results."""
 
@@ -76,7 +56,7 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
 
 def _decisive(options: argparse.Namespace) -> dict[str, Any]:
     """Return the options that affect the results, as JSON values; None for no value or no limit."""
-    values = {name: getattr(options, name) for name in _DECISIVE}
+    values = {name: getattr(options, name) for name in _DECISIVE.split()}
     sides = values["workspace"]
     values["workspace"] = sides and [side if math.isfinite(side) else None for side in sides]
     for name in ("masks", "poses"):
@@ -115,31 +95,11 @@ class Outputs:
                     output.close()
             raise
         self._stems: set[str] = set()
-        given = {output_file.free_name(_stem(entry), self._stems): entry for entry in self.done}
-        with_bodies = [stem for stem, entry in given.items() if _has_body(entry)]
-        for folder, suffix, stems, thing in (
-            (options.pictures, "png", list(given), "a picture"),
-            (options.meshes, options.mesh_format, with_bodies, "a mesh of their bodies"),
-            (
-                options.export and options.export_folder,
-                scene_export.SUFFIXES.get(options.export, ".")[1:],
-                with_bodies,
-                "a scene",
-            ),
-        ):
-            lost = sum(not (folder / f"{stem}.{suffix}").is_file() for stem in stems) if folder else 0
-            if lost:
-                console.complain(
-                    f"warning: --jsonl: {options.jsonl} has {len(given)} frames already, which are not recovered "
-                    f"again: {lost} of them without {thing} in {folder}"
-                )
+        for entry in self.done:
+            output_file.free_name(_stem(entry), self._stems)
 
     def add(
-        self,
-        frame: RecordedFrame,
-        recovery: FrameRecovery,
-        tracks: Sequence[Followed] | None,
-        entry: dict[str, Any],
+        self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None, entry: dict[str, Any]
     ) -> None:
         """Write a frame, its recovery, and its element of ``frames``; raises OSError on failure."""
         options = self._options
@@ -150,9 +110,8 @@ class Outputs:
         if options.meshes:
             _write_mesh(options.meshes / f"{stem}.{options.mesh_format}", frame, recovery)
         if options.export:
-            _write_scene(
-                options.export_folder / f"{stem}{scene_export.SUFFIXES[options.export]}", frame, recovery, options
-            )
+            suffix = scene_export.SUFFIXES[options.export]
+            _write_scene(options.export_folder / f"{stem}{suffix}", frame, recovery, options)
         if self._bag is not None:
             try:
                 self._bag.add(frame, recovery, tracks)
@@ -203,12 +162,6 @@ def _stem(entry: Mapping[str, Any]) -> str:
     return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
 
 
-def _has_body(entry: Mapping[str, Any]) -> bool:
-    """Return whether an element of ``frames`` has a body that did not fail, and so a mesh."""
-    statuses = [body.get("status") for body in entry["superquadrics"] if isinstance(body, Mapping)]
-    return any(status != Status.FAILED.name.lower() for status in statuses)
-
-
 def _lines(options: argparse.Namespace) -> result_json.ResultLines | None:
     if not options.jsonl:
         return None
@@ -248,27 +201,17 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     """Write the bodies of a frame, or their parts; no file if there are none."""
-    shown = [
-        (k, name, solid)
-        for k, body in enumerate(recovery.bodies)
-        if body.status != Status.FAILED
-        for name, solid in zip(_names(k, len(body.solids)), body.solids, strict=True)
-    ]
-    if not shown:
-        return
-    with output_file.writing(path) as partial:
-        mesh.export(
-            [in_result_frame(solid, frame.is_cube) for _, _, solid in shown],
-            partial,
-            colours=mesh.COLOURS[[k % len(mesh.COLOURS) for k, _, _ in shown]],
-            names=[name for _, name, _ in shown],
-            optical=not frame.is_cube,
-        )
-
-
-def _names(number: int, count: int) -> list[str]:
-    """``body_3``, or ``body_3_part_1`` ... where it has parts."""
-    return [f"body_{number}"] if count == 1 else [f"body_{number}_part_{k}" for k in range(1, count + 1)]
+    solids, names, colours = [], [], []
+    for k, body in enumerate(recovery.bodies):
+        if body.status == Status.FAILED:
+            continue
+        for part, solid in enumerate(body.solids, 1):
+            solids.append(in_result_frame(solid, frame.is_cube))
+            names.append(f"body_{k}" + f"_part_{part}" * (len(body.solids) > 1))
+            colours.append(k % len(mesh.COLOURS))
+    if solids:
+        with output_file.writing(path) as partial:
+            mesh.export(solids, partial, colours=mesh.COLOURS[colours], names=names, optical=not frame.is_cube)
 
 
 def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, options: argparse.Namespace) -> None:

@@ -36,9 +36,6 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryO
 from sq_perception.recovery.recovery import edges_as_text, place_as_text
 from sq_perception.recovery.still_scene import StillScene
 
-_AXES = re.compile(" along [xyz]( and [xyz])*")
-"""Names of axes, which the deviations show anyway."""
-
 
 def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
     """Return the lines of all frames, then the reasons with their number of bodies."""
@@ -58,7 +55,8 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
             if verbose:
                 yield "    " + _details(body)
             elif body["status"] != "converged":
-                reasons[body["status"], _AXES.sub("", body["message"].partition(";")[0])] += 1
+                reason = re.sub(" along [xyz]( and [xyz])*", "", body["message"].partition(";")[0])
+                reasons[body["status"], reason] += 1
     for (status, reason), count in reasons.most_common():
         yield f"{count} {status}: {reason}"
     if reasons:
@@ -91,13 +89,10 @@ def _sigmas(body: Mapping[str, Any]) -> list[float]:
 
 
 def _details(body: Mapping[str, Any]) -> str:
-    known = {
-        "exponents": " ".join(f"{value:.2f}" for value in body["shape"]),
-        "score": f"{body['score']:.3f}",
-        "seen": " ".join("?" if share is None else f"{share:.0%}" for share in body["seen"]),
-        "pixels": str(body["pixels"]),
-    }
-    return ", ".join(f"{name} {value}" for name, value in known.items()) + f": {body['message']}"
+    exponents = " ".join(f"{value:.2f}" for value in body["shape"])
+    seen = " ".join("?" if share is None else f"{share:.0%}" for share in body["seen"])
+    facts = f"exponents {exponents}, score {body['score']:.3f}, seen {seen}, pixels {body['pixels']}"
+    return f"{facts}: {body['message']}"
 
 
 def run(options: argparse.Namespace) -> int:
@@ -148,32 +143,21 @@ class RecoverRun:
             parts=options.parts,
         )
         done = result_json.Recovered()
-        wanted = InputOptions(
-            options.camera_info,
-            options.projection,
-            options.topic,
-            options.every,
-            options.limit,
-            options.distortion,
-            Reading(
-                options.depth_scale,
-                options.depth_min,
-                options.depth_max,
-                options.roi,
-                options.masks,
-                options.ignore_masks,
-                options.depth_kind,
-                options.frame,
-            ),
-            options.camera_info_topic,
-        )
+        o = options
+        limits = o.depth_scale, o.depth_min, o.depth_max, o.roi, o.masks, o.ignore_masks, o.depth_kind, o.frame
+        source = o.camera_info, o.projection, o.topic, o.every, o.limit, o.distortion
+        wanted = InputOptions(*source, Reading(*limits), o.camera_info_topic)
         self._recorded = RecordedInput(options.frames, wanted, done)
         if problem := replaced_input(options, self._recorded.files):
             raise ValueError(problem)
         if options.method in NEEDS_NETWORK:
             checkpoint.check(options.model)
         # First: nothing is begun with damaged weights, or before a Ctrl-C meanwhile.
-        self._executor = self._make_executor()
+        self._executor: Recoverer | workers.Processes = (
+            workers.Processes(workers.Setup(options.model, self._settings), options.jobs)
+            if options.jobs > 1
+            else Recoverer(options.model, method=options.method)
+        )
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
         poses = CameraPoses(options.poses) if options.poses else None
@@ -181,13 +165,6 @@ class RecoverRun:
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}"), poses) if is_tracked else None
         self._unreadable = 0
         self._said: dict[str, set[str]] = {}
-
-    def _make_executor(self) -> Recoverer | workers.Processes:
-        options = self._options
-        setup = workers.Setup(options.model, self._settings)
-        if options.jobs > 1:
-            return workers.Processes(setup, options.jobs)
-        return Recoverer(options.model, method=options.method)
 
     def over_all_frames(self) -> int:
         """Recover all frames; return the exit code."""

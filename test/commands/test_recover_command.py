@@ -670,7 +670,7 @@ def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch, capsys):
     assert run(folder, "--jsonl", lines, "--mcap", tmp_path / "out.mcap") == 2
 
 
-def test_pictures_of_a_resumed_run_keep_their_names(tmp_path, monkeypatch, capsys):
+def test_pictures_of_a_resumed_run_keep_their_names(tmp_path, monkeypatch):
     """Three frames of one name; after the first there are two left, and they do not take its picture's place."""
     monkeypatch.setattr(recover_outputs, "_draw", lambda path, *_: path.write_bytes(b""))
     frames = [tmp_path / name / "f.npz" for name in "abc"]
@@ -687,22 +687,3 @@ def test_pictures_of_a_resumed_run_keep_their_names(tmp_path, monkeypatch, capsy
     assert run(*frames, "--jsonl", lines, "--pictures", pictures) == 0
     assert sorted(path.name for path in pictures.iterdir()) == ["f.png", "f_2.png", "f_3.png"]
     assert (pictures / "f.png").stat().st_mtime_ns == first
-    assert "not recovered again" not in capsys.readouterr().err
-    assert run(*frames, "--jsonl", lines, "--pictures", tmp_path / "others") == 0
-    assert "has 3 frames already, which are not recovered again: 3 of them" in capsys.readouterr().err
-
-
-def test_a_resumed_run_says_which_meshes_it_does_not_write(tmp_path, capsys):
-    """Of two frames that are done one has a body; its mesh is missed where it was not asked for before."""
-    frames = [save_npz(tmp_path / "a.npz"), save_npz(tmp_path / "nothing.npz", np.full((120, 160), np.nan))]
-    lines, meshes = tmp_path / "out.jsonl", tmp_path / "meshes"
-    assert run(*frames, "--jsonl", lines) == 0
-    assert "not recovered again" not in capsys.readouterr().err
-    assert run(*frames, "--jsonl", lines, "--meshes", meshes) == 0
-    assert f"2 frames already, which are not recovered again: 1 of them without a mesh of their bodies in {meshes}" in (
-        capsys.readouterr().err
-    )
-    lines.unlink()
-    for _ in range(2):
-        assert run(*frames, "--jsonl", lines, "--meshes", meshes) == 0
-        assert "not recovered again" not in capsys.readouterr().err
