@@ -37,9 +37,7 @@ from sq_perception.learning.network_config import MaskConfig, RegressorConfig, T
 if TYPE_CHECKING:
     import torch
 
-    from sq_perception.learning.mask_network import MaskNetwork
-    from sq_perception.learning.regressor import Regressor
-    from sq_perception.learning.thing_network import ThingNetwork
+    from sq_perception.learning.networks import MaskNetwork, Regressor, ThingNetwork
 
 FORMAT, THING_FORMAT, MASK_FORMAT = "sq_perception.regressor", "sq_perception.things", "sq_perception.masks"
 _FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT, MaskConfig: MASK_FORMAT}
@@ -106,21 +104,21 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
     CheckpointError
         As :func:`read`.
     """
-    from sq_perception.learning.regressor import Regressor
+    from sq_perception.learning.networks import Regressor
 
     return _module(Regressor, *read(RegressorConfig, path)).to(device).eval()
 
 
 def load_things(path: Path | str | None = None, device: str | torch.device = "cpu") -> ThingNetwork:
     """The network of things, None for the one that ships; otherwise as :func:`load`."""
-    from sq_perception.learning.thing_network import ThingNetwork
+    from sq_perception.learning.networks import ThingNetwork
 
     return _module(ThingNetwork, *read(ThingConfig, path)).to(device).eval()
 
 
 def load_masks(path: Path | str | None = None) -> MaskNetwork:
     """The network of masks on the cpu, None for the one that ships; otherwise as :func:`load`."""
-    from sq_perception.learning.mask_network import MaskNetwork
+    from sq_perception.learning.networks import MaskNetwork
 
     return _module(MaskNetwork, *read(MaskConfig, path)).eval()
 

@@ -36,7 +36,7 @@ from sq_perception.learning.network_config import (
 from sq_perception.learning.positions import predict_in_positions
 
 if TYPE_CHECKING:
-    from sq_perception.learning.thing_network import ThingNetwork
+    from sq_perception.learning.networks import ThingNetwork
 
 
 class Predictor(Protocol):
@@ -63,7 +63,7 @@ class HullPredictions:
     bodies : Superquadric
         Batch (n,).
     support : (n, J)
-        Support functions in sides of the view, from its middle (:data:`sq_perception.learning.thing_network.MIDDLE`).
+        Support functions in sides of the view, from c of :mod:`sq_perception.learning.networks`.
     covariance : (n, J, J)
         Scale of their errors.
     freedom : float
