@@ -36,7 +36,7 @@ def thing_views(arguments: Sequence[str]) -> int:
     )
     given = command.parse_args(arguments)
 
-    from sq_perception.simulation.scanned_things import read_things
+    from sq_perception.simulation.thing import read_things
     from sq_perception.simulation.thing_views import draw_thing_views
 
     def drawing() -> Callable[[Any], Any]:

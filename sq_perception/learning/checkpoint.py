@@ -99,10 +99,7 @@ def save(
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
     """A network as a module of torch, in evaluation mode; the path as :func:`resolve` takes it.
 
-    Raises
-    ------
-    CheckpointError
-        As :func:`read`.
+    Raises CheckpointError as :func:`read`.
     """
     from sq_perception.learning.networks import Regressor
 
@@ -137,10 +134,8 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
 
     The path is as :func:`resolve` takes it, None for the weights of this kind that are used where none are named.
 
-    Raises
-    ------
-    CheckpointError
-        If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
+    Raises CheckpointError if the file is missing, no safetensors file, of another format or version, or does not fit
+    its own config.
     """
     path = resolve(_SHIPPED[kind] if path is None else path)
     data, _ = _bytes(path)
@@ -228,10 +223,7 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
 def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
     """The form that a header describes.
 
-    Raises
-    ------
-    CheckpointError
-        If it describes none.
+    Raises CheckpointError if it describes none.
     """
     if header.get("format") != _FORMATS[kind]:
         raise CheckpointError(f"{path}: expected a header 'format: {_FORMATS[kind]}', got {header.get('format')!r}")

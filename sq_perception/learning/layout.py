@@ -30,10 +30,7 @@ _HEADS = {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head
 def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:
     """Name and shape of every weight.
 
-    Raises
-    ------
-    ValueError
-        For numbers of channels or outputs that are no positive integers.
+    Raises ValueError for numbers of channels or outputs that are no positive integers.
     """
     found = _masks(config) if isinstance(config, MaskConfig) else _bodies(config)
     if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):

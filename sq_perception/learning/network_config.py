@@ -38,10 +38,8 @@ LEAST_LOG, MOST_LOG = -5.0, 0.5
 class RegressorConfig:
     """Everything that fixes the network's form; travels in the checkpoint's header.
 
-    Raises
-    ------
-    ValueError
-        For an unknown backbone or framing, a side that the backbone cannot halve often enough, or an empty range.
+    Raises ValueError for an unknown backbone or framing, a side that the backbone cannot halve often enough, or an
+    empty range.
     """
 
     pixels: int = 64

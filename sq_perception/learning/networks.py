@@ -211,10 +211,7 @@ class Regressor(nn.Module):
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).
 
-        Raises
-        ------
-        ValueError
-            If the views are not (n, p, p) with p = ``config.pixels``, or not finite.
+        Raises ValueError if the views are not (n, p, p) with p = ``config.pixels``, or not finite.
         """
         batch = torch.from_numpy(check_views(views, self.config))[:, None]
         self.eval()
@@ -233,26 +230,13 @@ class Regressor(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class HullPrediction:
-    """What the network predicts for a batch of views, in the views' frames; arrays of torch.
+    """What the network predicts for a batch of views, in the views' frames; arrays of torch."""
 
-    Attributes
-    ----------
-    body : Superquadric
-        Batch (b,).
-    support : (b, J)
-        mu, in sides of the view.
-    log_sigma : (b, J)
-    factors : (b, J, K)
-        L.
-    freedom : float
-        nu.
-    """
-
-    body: Superquadric
-    support: torch.Tensor
-    log_sigma: torch.Tensor
-    factors: torch.Tensor
-    freedom: float
+    body: Superquadric  # batch (b,)
+    support: torch.Tensor  # (b, J), mu, in sides of the view
+    log_sigma: torch.Tensor  # (b, J)
+    factors: torch.Tensor  # (b, J, K), L
+    freedom: float  # nu
 
     def covariance(self) -> torch.Tensor:
         """S (b, J, J)."""

@@ -103,10 +103,7 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
 def read_views(none: Any, paths: list[Path]) -> Any:
     """All views of some shards, in the form of ``none``.
 
-    Raises
-    ------
-    ValueError
-        If a shard is damaged, or of another form, or all of them are empty.
+    Raises ValueError if a shard is damaged, or of another form, or all of them are empty.
     """
     kind, shards = type(none), []
     for path in paths:
@@ -132,17 +129,10 @@ def _to_stored(views: Any) -> dict[str, np.ndarray]:
 def train(subject: Subject, config: ShardTraining, views: Path, output: Path) -> Any:
     """Run, or continue, a training; returns the averaged network, also kept in ``output``/NAME.safetensors.
 
-    Raises
-    ------
-    ValueError
-        If the folder holds no more shards than are kept for validation, or one that cannot be read, or for a device
-        that this machine does not have.
-    OSError
-        If a shard that is kept for validation is gone.
-    CheckpointError
-        If a file to begin or to go on with does not fit.
-    ArithmeticError, Stopped
-        As :func:`sq_perception.learning.training.run`.
+    Raises ValueError if the folder holds no more shards than are kept for validation, or one that cannot be read, or
+    for a device that this machine does not have; OSError if a shard that is kept for validation is gone;
+    CheckpointError if a file to begin or to go on with does not fit; ArithmeticError or Stopped as
+    :func:`sq_perception.learning.training.run`.
     """
     device = torch.device(check_device(config.device))
     with threads(config.threads):

@@ -61,14 +61,9 @@ def train(
     advance
         Called with the steps done and the loss of the last one.
 
-    Raises
-    ------
-    ArithmeticError, Stopped
-        As :func:`sq_perception.learning.training.run`.
-    CheckpointError
-        If a file to begin or to go on with does not fit.
-    ValueError
-        For a device that this machine does not have, or data or a network to begin with of another form.
+    Raises ArithmeticError or Stopped as :func:`sq_perception.learning.training.run`; CheckpointError if a file to begin
+    or to go on with does not fit; ValueError for a device that this machine does not have, or data or a network to
+    begin with of another form.
     """
     device = torch.device(check_device(config.device))
     with threads(config.threads):

@@ -69,10 +69,7 @@ class Course:
 class TrainingState:
     """What a training holds between two steps; goes on from the file where there is one.
 
-    Raises
-    ------
-    CheckpointError
-        If the file is damaged, or of a run with another network.
+    Raises CheckpointError if the file is damaged, or of a run with another network.
     """
 
     path: Path
@@ -100,10 +97,7 @@ class TrainingState:
     def begin(cls, model: Any, config: Run, output: Path, form: tuple[str, ...] = ()) -> TrainingState:
         """The state of a new run of a network, or of the one that ``output`` holds.
 
-        Raises
-        ------
-        CheckpointError
-            Also where that one differs in a setting of ``form``.
+        Raises CheckpointError also where that one differs in a setting of ``form``.
         """
         path, device = output / "state.safetensors", next(model.parameters()).device
         before = settings_before(path)
@@ -168,10 +162,7 @@ class TrainingState:
 
         Early in a run they keep less than ``keep`` of themselves.
 
-        Raises
-        ------
-        ArithmeticError
-            If the loss or its gradient is not finite; the weights are left as they are.
+        Raises ArithmeticError if the loss or its gradient is not finite; the weights are left as they are.
         """
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -210,12 +201,8 @@ def run(
 ) -> Any:
     """Run a training to its end; returns the averaged network, which the folder of the state keeps.
 
-    Raises
-    ------
-    ArithmeticError
-        When the loss or a gradient is no longer finite; the last saved state stays as it was.
-    Stopped
-        After SIGINT or SIGTERM; the state is saved first.
+    Raises ArithmeticError when the loss or a gradient is no longer finite; the last saved state stays as it was;
+    Stopped after SIGINT or SIGTERM; the state is saved first.
     """
     device, losses, rate = next(state.model.parameters()).device, list[float](), 0.0
     began = saved = time.monotonic()

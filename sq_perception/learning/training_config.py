@@ -115,10 +115,7 @@ class Run:
 class TrainingConfig(Run):
     """A run of the regressor.  The defaults are those of the compact network under L_OC.
 
-    Raises
-    ------
-    ValueError
-        For an unknown name, a number out of its range, or settings that contradict each other.
+    Raises ValueError for an unknown name, a number out of its range, or settings that contradict each other.
     """
 
     loss: str = _setting("occupancy", "What is minimised; the equations are in sq_perception/learning/losses.py.")
@@ -218,10 +215,7 @@ MASK_RUN = ShardTraining(minutes=60.0, learning_rate=3e-3, weight_decay=1e-3)
 def read(path: str | Path, **changes: Any) -> TrainingConfig:
     """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.
 
-    Raises
-    ------
-    ValueError
-        If there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
+    Raises ValueError if there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
     """
     return TrainingConfig(**{**_values(path), **changes})
 
