@@ -30,7 +30,7 @@ import numpy as np
 from common import report
 
 from sq_perception.simulation.camera_stages import draw_stages
-from sq_perception.simulation.thing_sensing import measure_by_any
+from sq_perception.simulation.thing_views import measure_by_any
 from sq_perception.simulation.things_on_table import things_on_table
 
 FIGURES = ("gaps beside", "gaps on", "smear", "lost edge", "correlation 1", "correlation 4")

@@ -39,7 +39,7 @@ from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewSource, draw_views
 from sq_perception.learning.forward import CompactRegressor
 from sq_perception.learning.network_config import check_views
-from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.simulation.scenes import thesis_bodies
 

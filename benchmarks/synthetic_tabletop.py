@@ -2,7 +2,7 @@
 
     python benchmarks/synthetic_tabletop.py [--scenes 60] [--sensors realsense_d435 ...] [--name synthetic_tabletop]
 
-Scenes: those of :mod:`sq_perception.simulation.crowds`, 640 x 480 pixels, from 0.5 to 1.2 m, scene k from
+Scenes: those of :mod:`sq_perception.simulation.scenes`, 640 x 480 pixels, from 0.5 to 1.2 m, scene k from
 the seed (``SEED``, k) alone.  Sensors: those of sq_perception.simulation.sensor_noise,
 and ``plain``: sigma = 1.5 mm z^2 for each
 pixel by itself, then millimetres.
@@ -33,8 +33,7 @@ from sq_perception.geometry import Superquadric, metrics
 from sq_perception.imaging import raycast
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.crowds import draw_crowd
-from sq_perception.simulation.scenes import Scene
+from sq_perception.simulation.scenes import Scene, draw_crowd
 
 SEED = 7500
 BODIES = (2, 12)

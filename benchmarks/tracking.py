@@ -46,8 +46,7 @@ from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation.scenes import Scene, table_scene
-from sq_perception.simulation.sensor_model import Ideal
-from sq_perception.simulation.sensor_noise import SensorNoise, preset
+from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, preset
 from sq_perception.tracking.forms import TURNS
 from sq_perception.tracking.session import Followed, TrackingSession
 

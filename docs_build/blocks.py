@@ -111,7 +111,8 @@ def prediction() -> str:
     path = PACKAGE / "weights" / "things.safetensors"
     with path.open("rb") as file:
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-    validation = json.loads(header["__metadata__"]["validation"])
+    metadata = header["__metadata__"]
+    validation = json.loads(metadata.get("metrics") or metadata["validation"])
     kinds = {name: values for name, values in validation.items() if isinstance(values, list)}
     least, most = (choose(kinds, key=lambda name: kinds[name][1]) for choose in (min, max))
     return (

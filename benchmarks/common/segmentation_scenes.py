@@ -28,7 +28,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import move
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
+from sq_perception.simulation import furniture, scenes, sensor_noise, thing_views
 from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.scenes import plane_depth, turn_about_up
@@ -68,7 +68,7 @@ def scene(kind: str, seed: int) -> SegmentationScene:
     sensor = "random"
     if rng.random() < _RANDOM_SENSOR:
         seen = labels > 0 if labels.any() else np.ones(labels.shape, bool)
-        measured = thing_sensing.measure_by_any(depth, seen, camera, Stages(), rng)
+        measured = thing_views.measure_by_any(depth, seen, camera, Stages(), rng)
     else:
         sensor = str(rng.choice(list(sensor_noise.PRESETS)))
         measured = sensor_noise.preset(sensor).measured(depth, camera, rng)
@@ -101,12 +101,12 @@ def _tables(low: float, high: float) -> Callable[[np.random.Generator, Camera], 
 
 def _with_room(rng: np.random.Generator, camera: Camera) -> _Drawn:
     made = things_on_table(rng, camera=camera, elevation=(8.0, 50.0))
-    return room.behind(made, rng), made.labels
+    return furniture.add_room(made, rng), made.labels
 
 
 def _nothing(rng: np.random.Generator, camera: Camera) -> _Drawn:
     made = things_on_table(rng, 1, camera, (8.0, 70.0))
-    depth = room.behind(made, rng) if rng.random() < 0.6 else made.depth
+    depth = furniture.add_room(made, rng) if rng.random() < 0.6 else made.depth
     empty = np.minimum(plane_depth(made.plane, camera), made.wall)
     return np.where(made.labels > 0, empty, depth), np.zeros_like(made.labels)
 
@@ -120,7 +120,7 @@ def _in_furniture(name: str) -> Callable[[np.random.Generator, Camera], _Drawn]:
 
 
 def _crowd(rng: np.random.Generator, camera: Camera) -> _Drawn:
-    depth, labels = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
+    depth, labels = scenes.draw_crowd(rng, int(rng.integers(1, scenes.MOST + 1)), camera).render()
     return np.where(np.isnan(depth), np.inf, depth), labels
 
 

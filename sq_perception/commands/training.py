@@ -93,7 +93,7 @@ def thing_views(arguments: Sequence[str]) -> int:
     )
     given = command.parse_args(arguments)
 
-    from sq_perception.simulation.scanned_things import read_things
+    from sq_perception.simulation.thing import read_things
     from sq_perception.simulation.thing_views import draw_thing_views
 
     def drawing() -> Callable[[Any], Any]:
@@ -126,7 +126,7 @@ def train_things(arguments: Sequence[str]) -> int:
     example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"
     options = vars(_make_training_parser("things", text, example, THING_RUN).parse_args(arguments))
 
-    from sq_perception.learning.thing_training import THINGS
+    from sq_perception.learning.shard_training import THINGS
 
     return _train(THINGS, THING_RUN, options)
 
@@ -139,7 +139,7 @@ def train_masks(arguments: Sequence[str]) -> int:
     example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
     options = vars(_make_training_parser("masks", text, example, MASK_RUN).parse_args(arguments))
 
-    from sq_perception.learning.mask_training import MASKS
+    from sq_perception.learning.shard_training import MASKS
 
     return _train(MASKS, MASK_RUN, options)
 
@@ -177,7 +177,7 @@ def _make_training_parser(subject: str, text: str, example: str, run: ShardTrain
     add("--output", "-o", type=Path, default=Path(f"runs/{subject}"), help="folder (%(default)s)")
     add("--minutes", type=positive, help="training time, over which the learning rate falls (%(default)s)")
     add("--batch", type=at_least(1), help="views per step (%(default)s)")
-    add("--rate", type=positive, help="largest learning rate (%(default)s)")
+    add("--rate", dest="learning_rate", metavar="RATE", type=positive, help="largest learning rate (%(default)s)")
     add("--threads", type=at_least(0), help="threads of torch; 0: its own choice")
     add("--device", help="cpu or cuda (%(default)s)")
     add("--validation", type=at_least(1), help="steps between two validations (%(default)s)")
@@ -191,13 +191,14 @@ def _make_training_parser(subject: str, text: str, example: str, run: ShardTrain
 def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
     from sq_perception.learning import shard_training
     from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.learning.training import Stopped
 
     views, output = options.pop("views"), options.pop("output")
     try:
         shard_training.train(subject, replace(run, **options), views, output)
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
         return fail(f"train-{subject.name}: {error}")
-    except KeyboardInterrupt:
-        complain(f"train-{subject.name}: stopped; the same command goes on from the last validation")
+    except Stopped as stopped:
+        complain(f"train-{subject.name}: {stopped}")
         return INTERRUPTED
     return SUCCESS

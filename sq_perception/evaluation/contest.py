@@ -54,30 +54,16 @@ class Answers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Contestant:
-    """A network alone, or a method of the recovery with a fit.
+    """A network alone, or a method of the recovery with a fit."""
 
-    Attributes
-    ----------
-    name : str
-        Short, unique within a comparison; also names files.
-    description : str
-        One line for the reader.
-    loss : str
-        What a network was trained by; empty where its file does not name it, and for fits.
-    recover
-        Answers for depth images (n, 256, 256), given the number of the first within the test set.
-    has_canonical_labels : bool
-        Whether labels are in canonical form.
-    notes : dict
-        JSON values: of a network its file, and the notes of its header.
-    """
-
-    name: str
-    description: str
-    loss: str
+    name: str  # short, unique within a comparison; also names files
+    description: str  # one line for the reader
+    loss: str  # what a network was trained by; empty where its file does not name it, and for fits
     recover: Callable[[int, np.ndarray], Answers]
-    has_canonical_labels: bool = True
+    """Answers for depth images (n, 256, 256), given the number of the first within the test set."""
+    has_canonical_labels: bool = True  # whether labels are in canonical form
     notes: dict[str, Any] = field(default_factory=dict)
+    """JSON values: of a network its file, and the notes of its header."""
 
     def labels(self, truth: Superquadric) -> Superquadric:
         """The true bodies, each in the parameter vector with which rotations are to be compared."""
@@ -91,10 +77,8 @@ class Contestant:
 def network(path: Path, name: str | None = None) -> Contestant:
     """The network of a weights file.
 
-    Raises
-    ------
-    CheckpointError
-        If the file is missing, damaged or of another kind, or its header names a loss that is not known.
+    Raises CheckpointError if the file is missing, damaged or of another kind, or its header names a loss that is not
+    known.
     """
     model = inference.load(path)
     header = checkpoint.read_header(path)
@@ -188,10 +172,7 @@ def compare(
     advance
         Called with a contestant's name and the number of bodies done.
 
-    Raises
-    ------
-    ValueError
-        If a contestant is to recover no body, or more than there are.
+    Raises ValueError if a contestant is to recover no body, or more than there are.
     """
     for contestant, count in contestants:
         if not 1 <= count <= images.count:

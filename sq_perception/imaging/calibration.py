@@ -50,22 +50,14 @@ _RECTIFIED = re.compile(r"rect(ified)?")
 
 @dataclass(frozen=True)
 class Calibration:
-    """What is known of the camera of an image; :meth:`of` makes one from a camera_info.
+    """What is known of the camera of an image; :meth:`of` makes one from a camera_info."""
 
-    Attributes
-    ----------
-    camera : Camera
-        The pinhole camera of the rectified images.
-    rectification : Rectification or None
-        From raw images to those of ``camera``; None where they are sent rectified.
-    note : str
-        What auto has decided about distortion coefficients that are there, and how to change that; empty if it had
-        nothing to decide.
-    """
-
-    camera: Camera
+    camera: Camera  # the pinhole camera of the rectified images
     rectification: Rectification | None = None
+    """From raw images to those of ``camera``; None where they are sent rectified."""
     note: str = ""
+    """What auto has decided about distortion coefficients that are there, and how to change that; empty if it had
+    nothing to decide."""
 
     @classmethod
     def of(cls, info: Any, name: str = "", distortion: Treatment = "auto") -> Calibration:
@@ -82,10 +74,8 @@ class Calibration:
         distortion
             See the module.
 
-        Raises
-        ------
-        ValueError
-            If the camera_info is not usable; the message gives the reason and the setting that might help.
+        Raises ValueError if the camera_info is not usable; the message gives the reason and the setting that might
+        help.
         """
         if distortion not in get_args(Treatment):
             raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
@@ -116,10 +106,7 @@ class Calibration:
     def rectify(self, depth: np.ndarray) -> np.ndarray:
         """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.
 
-        Raises
-        ------
-        ValueError
-            If the image has not the size of ``size``; the message names the likely reason.
+        Raises ValueError if the image has not the size of ``size``; the message names the likely reason.
         """
         self.check(depth)
         return depth if self.rectification is None else self.rectification.there.depth(depth)
@@ -132,10 +119,7 @@ class Calibration:
     def as_sent(self, depth: np.ndarray) -> np.ndarray:
         """A depth image of ``camera`` with the pixels of the images as they are sent; metres, NaN or inf for nothing.
 
-        Raises
-        ------
-        ValueError
-            If the image has not the size of ``camera``.
+        Raises ValueError if the image has not the size of ``camera``.
         """
         self.camera.check_image(depth)
         return depth if self.rectification is None else self.rectification.back.depth(depth)

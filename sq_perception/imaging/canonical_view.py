@@ -63,29 +63,16 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class CanonicalView:
-    """The image of one object in its own unit cube.
+    """The image of one object in its own unit cube."""
 
-    Attributes
-    ----------
-    image : float32 (n, n)
-        z of the visible surface, 0 for background.
-    beside : float32 (n, n)
-        How much nearer what was measured beside the object is than its nearest surface there, in sides of the view,
-        -1 to 1: positive before it, 0 flush with it, -1 far behind it, on the plane, or not asked for.  Where nothing
-        was measured +inf within the mask, and NaN where the object may go on beyond it, else -1.
-    rotation : (4,)
-        Quaternion, optical frame to canonical frame.
-    anchor : (3,)
-        The optical frame's point that lands at (1/2, 1/2, z0), metres.
-    extent : float
-        Side of the cube, metres.
-    """
-
-    image: np.ndarray
+    image: np.ndarray  # float32 (n, n), z of the visible surface, 0 for background
     beside: np.ndarray
-    rotation: np.ndarray
-    anchor: np.ndarray
-    extent: float
+    """float32 (n, n), how much nearer what was measured beside the object is than its nearest surface there, in sides
+    of the view, -1 to 1: positive before it, 0 flush with it, -1 far behind it, on the plane, or not asked for. Where
+    nothing was measured +inf within the mask, and NaN where the object may go on beyond it, else -1."""
+    rotation: np.ndarray  # (4,), quaternion, optical frame to canonical frame
+    anchor: np.ndarray  # (3,), the optical frame's point that lands at (1/2, 1/2, z0), metres
+    extent: float  # side of the cube, metres
 
     @property
     def hidden(self) -> np.ndarray:
@@ -169,10 +156,7 @@ def from_mask(
         where the object ends: beside such a mask they show nothing of it.  By default a pixel that measured nothing
         hides something within the object's convex hull only.
 
-    Raises
-    ------
-    ValueError
-        If the images do not fit the camera, or no pixel of the mask has a depth.
+    Raises ValueError if the images do not fit the camera, or no pixel of the mask has a depth.
     """
     camera.check_image(depth)
     camera.check_image(mask)
@@ -226,10 +210,7 @@ def full_frame(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int)
     camera : Camera
         Orthographic, of the unit cube (:mod:`sq_perception.imaging.unit_cube`).
 
-    Raises
-    ------
-    ValueError
-        For a pinhole camera, or images that do not fit the camera.
+    Raises ValueError for a pinhole camera, or images that do not fit the camera.
     """
     if camera.is_pinhole:
         raise ValueError("a full frame shows the unit cube: expected an orthographic camera, got a pinhole camera")

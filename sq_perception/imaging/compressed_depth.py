@@ -43,10 +43,7 @@ def encoding(image_format: str) -> str | None:
 def size(image_format: str, data: bytes | np.ndarray) -> tuple[int, int]:
     """Width and height of a packed image, without unpacking it.
 
-    Raises
-    ------
-    ValueError
-        As :func:`decode`.
+    Raises ValueError as :func:`decode`.
     """
     _known(image_format)
     head = bytes(data[: _HEADER.size + _IMAGE_HEADER.size])
@@ -62,10 +59,7 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
     image_format, data
         ``format`` and ``data`` of the sensor_msgs/CompressedImage.
 
-    Raises
-    ------
-    ValueError
-        For another format, or data that is no such image; the message names what was expected.
+    Raises ValueError for another format, or data that is no such image; the message names what was expected.
     """
     packed = _known(image_format)
     message = bytes(data)

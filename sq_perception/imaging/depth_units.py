@@ -97,10 +97,7 @@ def metres(numbers: np.ndarray, scale: float | None = None, known: Stated | None
     known
         What is stated beside the image; of floats it only counts where they can hardly be metres.
 
-    Raises
-    ------
-    UnitsError
-        For raw disparities.
+    Raises UnitsError for raw disparities.
     """
     is_whole = numbers.dtype.kind in "iu"
     notes: list[str] = []

@@ -60,11 +60,8 @@ class Distortion:
         In OpenCV's order.  As for OpenCV, their number determines the terms, for plumb_bob and
         rational_polynomial alike: 4, 5, 8, or 12 and 14 where thin prism and tilt are zero.
 
-    Raises
-    ------
-    ValueError
-        For another model, another number of coefficients, a coefficient that is not finite or absurdly large, thin
-        prism or tilt.
+    Raises ValueError for another model, another number of coefficients, a coefficient that is not finite or absurdly
+    large, thin prism or tilt.
     """
 
     model: str

@@ -29,32 +29,20 @@ _STEEPEST = 10.0
 
 @dataclass(frozen=True, eq=False)
 class InverseDepth:
-    """An image of inverse depths with its slopes.
+    """An image of inverse depths with its slopes."""
 
-    Attributes
-    ----------
-    camera : Camera
-        Pinhole.
-    w : float32 (height, width)
-        1 / z, 0 where nothing is seen.
-    slope_u, slope_v : float32 (height, width)
-        dw/du and dw/dv of the surface in the pixel: the smaller of the differences to either side, which lies within
-        the surface where the other one crosses a jump.
-    """
-
-    camera: Camera
-    w: np.ndarray
+    camera: Camera  # pinhole
+    w: np.ndarray  # float32 (height, width), 1 / z, 0 where nothing is seen
     slope_u: np.ndarray
     slope_v: np.ndarray
+    """float32 (height, width), dw/du and dw/dv of the surface in the pixel: the smaller of the
+    differences to either side, which lies within the surface where the other one crosses a jump."""
 
     @classmethod
     def of(cls, depth: np.ndarray, camera: Camera) -> InverseDepth:
         """The inverse of a depth image (height, width), metres, positive; +inf or NaN where nothing is seen.
 
-        Raises
-        ------
-        ValueError
-            If the camera is no pinhole, or a depth is not positive.
+        Raises ValueError if the camera is no pinhole, or a depth is not positive.
         """
         if not camera.is_pinhole:
             raise ValueError(f"camera: expected a pinhole camera, got an {camera.projection} one")

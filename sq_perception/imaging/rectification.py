@@ -67,10 +67,8 @@ class Rectification:
         Size and intrinsics (K) of the raw images; pinhole.
     distortion : Distortion
 
-    Raises
-    ------
-    ValueError
-        If the camera is no pinhole, its images are too large, or the distortion cannot be undone in the middle of it.
+    Raises ValueError if the camera is no pinhole, its images are too large, or the distortion cannot be undone in the
+    middle of it.
     """
 
     raw: Camera
@@ -110,39 +108,24 @@ class Rectification:
 def rectification(raw: Camera, distortion: Distortion) -> Rectification:
     """The rectification of this calibration: equal calibrations share one, and its tables.
 
-    Raises
-    ------
-    ValueError
-        As :class:`Rectification`.
+    Raises ValueError as :class:`Rectification`.
     """
     return Rectification(raw, distortion)
 
 
 @dataclass(frozen=True, eq=False)
 class Lookup:
-    """Where the pixels (height, width) of one image lie in another, the source.
+    """Where the pixels (height, width) of one image lie in another, the source."""
 
-    Attributes
-    ----------
-    source : Camera
-        Camera of the images that are looked up in; others raise ValueError.
-    u, v : float32 (height, width)
-        Column and row in the source, far outside of it where it does not see the pixel.
-    left, top : float32 (height, width)
-        Column and row of the upper left one of the four neighbours.
-    close : uint8 (height, width)
-        1 where the place is as good as that of the nearest pixel.
-    step : float
-        Relative difference of depths beyond which neighbours show different surfaces.
-    """
-
-    source: Camera
+    source: Camera  # camera of the images that are looked up in; others raise ValueError
     u: np.ndarray
     v: np.ndarray
+    """float32 (height, width), column u and row v in the source, far outside of it where it sees nothing."""
     left: np.ndarray
     top: np.ndarray
-    close: np.ndarray
-    step: float
+    """float32 (height, width), column and row of the upper left one of the four neighbours."""
+    close: np.ndarray  # uint8 (height, width), 1 where the place is as good as that of the nearest pixel
+    step: float  # relative difference of depths beyond which neighbours show different surfaces
 
     @classmethod
     def of(cls, places: np.ndarray, source: Camera) -> Lookup:

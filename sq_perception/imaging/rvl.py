@@ -26,10 +26,7 @@ _MOST_GROUPS = 9
 def decode(data: bytes, width: int, height: int) -> np.ndarray:
     """The pixels, uint16 (height, width), 1 to ``MOST_PIXELS`` of them.
 
-    Raises
-    ------
-    ValueError
-        If the data does not hold that many pixels.
+    Raises ValueError if the data does not hold that many pixels.
     """
     count = width * height
     if len(data) > _MOST_BYTES * count + 64:

@@ -50,25 +50,18 @@ _HEIGHTS = (-0.3, 1.5)
 
 @dataclass(frozen=True, eq=False)
 class SegmentView:
-    """A segment and what is around it.
+    """A segment and what is around it."""
 
-    Attributes
-    ----------
-    image : float32 (PIXELS, PIXELS, CHANNELS)
-        See the module.
-    rows, columns : int (PIXELS,)
-        Pixels of the image under the middles of the cells; some may be outside of it.
-    left, top, side, height
-        The window, in pixels: its corner, where the image's is (0, 0), its width and its height.
-    """
-
-    image: np.ndarray
+    image: np.ndarray  # float32 (PIXELS, PIXELS, CHANNELS), see the module
     rows: np.ndarray
     columns: np.ndarray
+    """rows and columns: int (PIXELS,), pixels of the image under the middles of the cells; some may be outside of
+    it."""
     left: float
     top: float
     side: float
     height: float
+    """The window, in pixels: its corner, where the image's is (0, 0), its width and its height."""
 
     def of_part(self, cells: np.ndarray) -> np.ndarray:
         """The image as it would be if the segment had these cells alone, bool (PIXELS, PIXELS), and the rest of them

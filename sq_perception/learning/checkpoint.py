@@ -37,9 +37,7 @@ from sq_perception.learning.network_config import MaskConfig, RegressorConfig, T
 if TYPE_CHECKING:
     import torch
 
-    from sq_perception.learning.mask_network import MaskNetwork
-    from sq_perception.learning.regressor import Regressor
-    from sq_perception.learning.thing_network import ThingNetwork
+    from sq_perception.learning.networks import MaskNetwork, Regressor, ThingNetwork
 
 FORMAT, THING_FORMAT, MASK_FORMAT = "sq_perception.regressor", "sq_perception.things", "sq_perception.masks"
 _FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT, MaskConfig: MASK_FORMAT}
@@ -101,26 +99,23 @@ def save(
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
     """A network as a module of torch, in evaluation mode; the path as :func:`resolve` takes it.
 
-    Raises
-    ------
-    CheckpointError
-        As :func:`read`.
+    Raises CheckpointError as :func:`read`.
     """
-    from sq_perception.learning.regressor import Regressor
+    from sq_perception.learning.networks import Regressor
 
     return _module(Regressor, *read(RegressorConfig, path)).to(device).eval()
 
 
 def load_things(path: Path | str | None = None, device: str | torch.device = "cpu") -> ThingNetwork:
     """The network of things, None for the one that ships; otherwise as :func:`load`."""
-    from sq_perception.learning.thing_network import ThingNetwork
+    from sq_perception.learning.networks import ThingNetwork
 
     return _module(ThingNetwork, *read(ThingConfig, path)).to(device).eval()
 
 
 def load_masks(path: Path | str | None = None) -> MaskNetwork:
     """The network of masks on the cpu, None for the one that ships; otherwise as :func:`load`."""
-    from sq_perception.learning.mask_network import MaskNetwork
+    from sq_perception.learning.networks import MaskNetwork
 
     return _module(MaskNetwork, *read(MaskConfig, path)).eval()
 
@@ -139,10 +134,8 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
 
     The path is as :func:`resolve` takes it, None for the weights of this kind that are used where none are named.
 
-    Raises
-    ------
-    CheckpointError
-        If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
+    Raises CheckpointError if the file is missing, no safetensors file, of another format or version, or does not fit
+    its own config.
     """
     path = resolve(_SHIPPED[kind] if path is None else path)
     data, _ = _bytes(path)
@@ -230,10 +223,7 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
 def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
     """The form that a header describes.
 
-    Raises
-    ------
-    CheckpointError
-        If it describes none.
+    Raises CheckpointError if it describes none.
     """
     if header.get("format") != _FORMATS[kind]:
         raise CheckpointError(f"{path}: expected a header 'format: {_FORMATS[kind]}', got {header.get('format')!r}")

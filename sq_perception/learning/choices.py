@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal, get_args
 
 Backbone = Literal["compact", "resnet18"]
-"""The residual networks of :mod:`sq_perception.learning.backbone`."""
+"""The residual networks of :mod:`sq_perception.learning.networks`."""
 Framing = Literal["cropped", "full"]
 """What a view shows: one object that fills it, or the thesis' whole image."""
 Loss = Literal["occupancy", "occupancy_rotation", "dual", "mse", "least_squares", "least_squares_free", "render"]

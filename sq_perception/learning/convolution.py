@@ -145,7 +145,7 @@ class _Tiled:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """:class:`sq_perception.learning.backbone.ResidualBlock`; ``shortcut`` where it halves the resolution."""
+    """:class:`sq_perception.learning.networks.ResidualBlock`; ``shortcut`` where it halves the resolution."""
 
     first: Direct | _Tiled
     second: Direct | _Tiled

@@ -3,8 +3,7 @@
 :mod:`sq_perception.learning.convolution` has the layers.  One thread computes: the layers are small, and one
 that fits bodies meanwhile wants the other cores (:mod:`sq_perception.geometry.threads`).
 
-A test compares with the modules of torch (:mod:`sq_perception.learning.regressor`,
-:mod:`sq_perception.learning.thing_network`, :mod:`sq_perception.learning.mask_network`), which state the same networks.
+A test compares with the modules of torch (:mod:`sq_perception.learning.networks`), which state the same networks.
 """
 
 from __future__ import annotations
@@ -33,21 +32,21 @@ _AT_ONCE = 40
 
 
 class CompactRegressor:
-    """:class:`sq_perception.learning.regressor.Regressor` with a compact backbone, ready to predict."""
+    """:class:`sq_perception.learning.networks.Regressor` with a compact backbone, ready to predict."""
 
     def __init__(self, config: RegressorConfig, weights: Weights) -> None:
         self.config = config
         self._network = _Network(config, weights, channels=1)
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        """As :meth:`sq_perception.learning.regressor.Regressor.predict`, errors included."""
+        """As :meth:`sq_perception.learning.networks.Regressor.predict`, errors included."""
         views = check_views(views, self.config)
         raw = self._network.outputs(views[..., None], np.empty((len(views), 0), np.float32))
         return self.config.decode(raw.astype(float))
 
 
 class CompactThings:
-    """:class:`sq_perception.learning.thing_network.ThingNetwork`, ready to predict."""
+    """:class:`sq_perception.learning.networks.ThingNetwork`, ready to predict."""
 
     def __init__(self, config: ThingConfig, weights: Weights) -> None:
         self.config = config
@@ -57,7 +56,7 @@ class CompactThings:
     def predict(
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
-        """As :meth:`sq_perception.learning.thing_network.ThingNetwork.predict`, without torch."""
+        """As :meth:`sq_perception.learning.networks.ThingNetwork.predict`, without torch."""
         heights, scale = side_inputs(views, planes, extents)
         images = np.stack([views, heights], axis=-1)
         raw = self._network.outputs(images, np.column_stack([planes, scale]))
@@ -71,7 +70,7 @@ class CompactThings:
 
 
 class CompactMasks:
-    """:class:`sq_perception.learning.mask_network.MaskNetwork`, ready to predict."""
+    """:class:`sq_perception.learning.networks.MaskNetwork`, ready to predict."""
 
     def __init__(self, config: MaskConfig, weights: Weights) -> None:
         self.config = config
@@ -132,7 +131,7 @@ class _Network:
 
 
 class _Backbone:
-    """:func:`sq_perception.learning.backbone.compact_backbone`."""
+    """:func:`sq_perception.learning.networks.compact_backbone`."""
 
     def __init__(self, weights: Weights, pixels: int, channels: int) -> None:
         self._pixels, self._channels = pixels, channels

@@ -36,7 +36,7 @@ from sq_perception.learning.network_config import (
 from sq_perception.learning.positions import predict_in_positions
 
 if TYPE_CHECKING:
-    from sq_perception.learning.thing_network import ThingNetwork
+    from sq_perception.learning.networks import ThingNetwork
 
 
 class Predictor(Protocol):
@@ -47,33 +47,19 @@ class Predictor(Protocol):
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).
 
-        Raises
-        ------
-        ValueError
-            If the views are not (n, p, p) with p = ``config.pixels``, or not finite.
+        Raises ValueError if the views are not (n, p, p) with p = ``config.pixels``, or not finite.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class HullPredictions:
-    """What the network of things predicts for a batch of views, each in the frame of its view; NumPy.
+    """What the network of things predicts for a batch of views, each in the frame of its view; NumPy."""
 
-    Attributes
-    ----------
-    bodies : Superquadric
-        Batch (n,).
-    support : (n, J)
-        Support functions in sides of the view, from its middle (:data:`sq_perception.learning.thing_network.MIDDLE`).
-    covariance : (n, J, J)
-        Scale of their errors.
-    freedom : float
-        nu.
-    """
-
-    bodies: Superquadric
+    bodies: Superquadric  # batch (n,)
     support: np.ndarray
-    covariance: np.ndarray
-    freedom: float
+    """(n, J), support functions in sides of the view, from c of :mod:`sq_perception.learning.networks`."""
+    covariance: np.ndarray  # (n, J, J), scale of their errors
+    freedom: float  # nu
 
     def hull(self, number: int, view: CanonicalView) -> HullPrior:
         """The prediction of one view in the optical frame."""
@@ -100,10 +86,7 @@ class ThingPredictor:
 
         What the things stand on are planes (n, 4) in the frames of the views, zeros where there is none.
 
-        Raises
-        ------
-        ValueError
-            For views of another form, or not finite.
+        Raises ValueError for views of another form, or not finite.
         """
         views = check_views(views, self.config.regressor())
         both = np.concatenate([views, views[:, :, ::-1]])
@@ -124,10 +107,8 @@ class ThingPredictor:
 def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     """A predictor of bodies; the path as :func:`checkpoint.resolve` takes it.
 
-    Raises
-    ------
-    CheckpointError
-        As :func:`checkpoint.read`, and for a network that only torch computes where there is no torch.
+    Raises CheckpointError as :func:`checkpoint.read`, and for a network that only torch computes where there is no
+    torch.
     """
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
@@ -143,10 +124,7 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
     """A predictor of hulls, None for the network that ships; the device is one that :func:`check_device` has seen.
 
-    Raises
-    ------
-    CheckpointError
-        As :func:`checkpoint.read`.
+    Raises CheckpointError as :func:`checkpoint.read`.
     """
     if _is_cpu(device):
         return ThingPredictor(forward.CompactThings(*checkpoint.read(ThingConfig, path)))
@@ -156,10 +134,7 @@ def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPre
 def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
     """A network of masks, None for the one that ships, computed without torch.
 
-    Raises
-    ------
-    CheckpointError
-        As :func:`checkpoint.read`.
+    Raises CheckpointError as :func:`checkpoint.read`.
     """
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
 
@@ -194,10 +169,8 @@ def _is_cpu(device: str) -> bool:
 def check_device(device: str) -> str:
     """The name of a device that is there, as torch names it.
 
-    Raises
-    ------
-    ValueError
-        If it is none of cpu, cuda and cuda:N, or not the cpu and there is no torch, or torch sees no such device.
+    Raises ValueError if it is none of cpu, cuda and cuda:N, or not the cpu and there is no torch, or torch sees no such
+    device.
     """
     if device == "cpu":
         return device

@@ -30,10 +30,7 @@ _HEADS = {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head
 def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:
     """Name and shape of every weight.
 
-    Raises
-    ------
-    ValueError
-        For numbers of channels or outputs that are no positive integers.
+    Raises ValueError for numbers of channels or outputs that are no positive integers.
     """
     found = _masks(config) if isinstance(config, MaskConfig) else _bodies(config)
     if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):
@@ -59,7 +56,7 @@ def _bodies(config: RegressorConfig | ThingConfig) -> Shapes:
 
 
 def _masks(config: MaskConfig) -> Shapes:
-    """The weights of :class:`sq_perception.learning.mask_network.MaskNetwork`."""
+    """The weights of :class:`sq_perception.learning.networks.MaskNetwork`."""
     found: Shapes = {}
     _compact(found, config.widths, config.blocks, CHANNELS)
     for k, (fine, coarse) in enumerate(pairwise(config.widths)):
@@ -83,7 +80,7 @@ def heads(config: RegressorConfig | ThingConfig) -> dict[str, int]:
 
 
 def _compact(found: Shapes, widths: tuple[int, ...], blocks: int, channels: int) -> int:
-    """The weights of :func:`sq_perception.learning.backbone.compact_backbone`; its channels."""
+    """The weights of :func:`sq_perception.learning.networks.compact_backbone`; its channels."""
     stem, *stages = widths
     _convolution(found, "features.0", "features.1", channels, stem, 5)
     channels, number = stem, 3
@@ -95,7 +92,7 @@ def _compact(found: Shapes, widths: tuple[int, ...], blocks: int, channels: int)
 
 
 def _resnet18(found: Shapes) -> int:
-    """The weights of :class:`sq_perception.learning.backbone.ResNet18`; its channels."""
+    """The weights of :class:`sq_perception.learning.networks.ResNet18`; its channels."""
     channels = _RESNET18_CHANNELS[0]
     _convolution(found, "features.conv1", "features.bn1", 1, channels, 7)
     for stage, width in enumerate(_RESNET18_CHANNELS, 1):

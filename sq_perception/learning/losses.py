@@ -175,10 +175,7 @@ def render_loss(
 class Objective:
     """A loss and its settings; see the module.
 
-    Raises
-    ------
-    ValueError
-        For a loss of another name.
+    Raises ValueError for a loss of another name.
     """
 
     name: str = "occupancy"

@@ -1,7 +1,7 @@
 """Everything that fixes a network's form, how outputs become bodies and what a network is shown; without torch.
 
 Frames and units are those of the views: the unit cube, y up, z towards the viewer
-(:mod:`sq_perception.learning.regressor`, :mod:`sq_perception.learning.thing_network`).
+(:mod:`sq_perception.learning.networks`).
 """
 
 from __future__ import annotations
@@ -38,10 +38,8 @@ LEAST_LOG, MOST_LOG = -5.0, 0.5
 class RegressorConfig:
     """Everything that fixes the network's form; travels in the checkpoint's header.
 
-    Raises
-    ------
-    ValueError
-        For an unknown backbone or framing, a side that the backbone cannot halve often enough, or an empty range.
+    Raises ValueError for an unknown backbone or framing, a side that the backbone cannot halve often enough, or an
+    empty range.
     """
 
     pixels: int = 64
@@ -57,7 +55,7 @@ class RegressorConfig:
     translation_range: tuple[float, float] = (-0.4, 1.4)
     backbone: Backbone = "compact"
     framing: Framing = "cropped"
-    """What the views show, as :mod:`sq_perception.learning.regressor` has it."""
+    """What the views show, as :mod:`sq_perception.learning.networks` has it."""
     marks_hidden: bool = False
     """Whether views distinguish hidden pixels from background (``CanonicalView.marked``)."""
 

@@ -6,7 +6,7 @@ made of is imported when it is made, so that the command's help need not wait fo
 
 Learning rates over a run
 -------------------------
-    cosine     r = rate min(1, (k + 1) / warm_up) (1 + cos(pi k / steps)) / 2        at step k
+    cosine     r = rate min(1, (k + 1) / warm_up) (1 + cos(pi p)) / 2        at step k, a share p of the run
     plateau    r is divided by 10 after every 10 validations without a better one, and the run ends after 20 without one
 
 The plateau is the thesis' (chapter 5.3); its epoch is what lies between two validations here.
@@ -36,19 +36,11 @@ CHOICES: dict[str, tuple[str, ...]] = {
 """Fields that name something, and the names there are."""
 _SEEDS = 2**63
 """Seeds are below it, as torch takes them."""
-_PATIENCE = 10
-_LONGEST = 20
-_FACTOR = 0.1
 
 
 def _setting(default: Any, meaning: str) -> Any:
     """A field of a run, whose meaning the command's help shows."""
     return field(default=default, metadata={"help": meaning})
-
-
-def cosine(step: int, warm_up: int, steps: int) -> float:
-    """The share of the rate at a step."""
-    return min(1.0, (step + 1) / max(warm_up, 1)) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
 @dataclass
@@ -62,7 +54,7 @@ class Plateau:
     @property
     def share(self) -> float:
         """By which the learning rate is multiplied."""
-        return _FACTOR**self.reductions
+        return float(0.1**self.reductions)
 
     def record(self, loss: float) -> None:
         """Take note of a validation's loss."""
@@ -70,54 +62,21 @@ class Plateau:
             self.best, self.without_progress = loss, 0
             return
         self.without_progress += 1
-        if self.without_progress % _PATIENCE == 0:
+        if self.without_progress % 10 == 0:
             self.reductions += 1
 
     @property
     def exhausted(self) -> bool:
         """Whether nothing has become better for so long that the run should end."""
-        return self.without_progress >= _LONGEST
+        return self.without_progress >= 20
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
-    """A run.  The defaults are those of the compact network under L_OC.
+class Run:
+    """What the training of any network is made of; defaults are those of the compact regressor."""
 
-    Raises
-    ------
-    ValueError
-        For an unknown name, a number out of its range, or settings that contradict each other.
-    """
-
-    loss: str = _setting("occupancy", "What is minimised; the equations are in sq_perception/learning/losses.py.")
-    backbone: str = _setting("compact", "compact, or resnet18 as in the thesis.")
-    framing: str = _setting(
-        "cropped", "What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."
-    )
-    pixels: int = _setting(
-        64, "Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."
-    )
     start: str = _setting("", "A model file whose weights the network begins with; empty begins at random.")
-    canonical_labels: bool = _setting(
-        False, "List the axes of every label so that a1 >= a2; as drawn, their order is random."
-    )
-    pinhole_share: float = _setting(
-        0.0, "Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."
-    )
-    wide_share: float = _setting(
-        0.0, "Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."
-    )
-    occluded_share: float = _setting(0.0, "Share of the views with an occluder before the body.")
-    noisy_share: float = _setting(0.0, "Share of the views with noise, steps, holes and wrong edges.")
-    reuse: int = _setting(4, "How often a rendered view is used.")
-    steps: int = _setting(20000, "Steps of the run; with the plateau schedule, the most it may take.")
     batch: int = _setting(128, "Views a step.")
-    points: int = _setting(256, "Comparison points a body: half close around it, half in twice its box.")
-    sharpness_start: float = _setting(
-        0.0, "s of the loss at the start of the run, far basins first; 0 takes the loss's own value."
-    )
-    sharpness_end: float = _setting(0.0, "s of the loss at the end of the run.")
-    tau: float = _setting(0.0, "n tau / s of the render loss, how soon a ray is hit (7.10); 0 takes 2.")
     optimizer: str = _setting("adamw", "adamw, or adam as in the thesis.")
     schedule: str = _setting(
         "cosine",
@@ -139,6 +98,52 @@ class TrainingConfig:
     )
     device: str = _setting("cpu", "cpu or cuda.")
 
+    def progress(self, step: int, seconds: float, plateau: Plateau) -> float:
+        """The share of the run that is done, by its steps, its seconds and its validations."""
+        raise NotImplementedError
+
+    def rate(self, step: int, progress: float, plateau: Plateau) -> float:
+        """The learning rate of a step; see the module."""
+        if self.schedule == "plateau":
+            return self.learning_rate * plateau.share
+        rise = min(1.0, (step + 1) / max(self.warm_up, 1))
+        return self.learning_rate * rise * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+@dataclass(frozen=True)
+class TrainingConfig(Run):
+    """A run of the regressor.  The defaults are those of the compact network under L_OC.
+
+    Raises ValueError for an unknown name, a number out of its range, or settings that contradict each other.
+    """
+
+    loss: str = _setting("occupancy", "What is minimised; the equations are in sq_perception/learning/losses.py.")
+    backbone: str = _setting("compact", "compact, or resnet18 as in the thesis.")
+    framing: str = _setting(
+        "cropped", "What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."
+    )
+    pixels: int = _setting(
+        64, "Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."
+    )
+    canonical_labels: bool = _setting(
+        False, "List the axes of every label so that a1 >= a2; as drawn, their order is random."
+    )
+    pinhole_share: float = _setting(
+        0.0, "Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."
+    )
+    wide_share: float = _setting(
+        0.0, "Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."
+    )
+    occluded_share: float = _setting(0.0, "Share of the views with an occluder before the body.")
+    noisy_share: float = _setting(0.0, "Share of the views with noise, steps, holes and wrong edges.")
+    reuse: int = _setting(4, "How often a rendered view is used.")
+    steps: int = _setting(20000, "Steps of the run; with the plateau schedule, the most it may take.")
+    points: int = _setting(256, "Comparison points a body: half close around it, half in twice its box.")
+    sharpness_start: float = _setting(
+        0.0, "s of the loss at the start of the run, far basins first; 0 takes the loss's own value."
+    )
+    sharpness_end: float = _setting(0.0, "s of the loss at the end of the run.")
+    tau: float = _setting(0.0, "n tau / s of the render loss, how soon a ray is hit (7.10); 0 takes 2.")
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
@@ -176,50 +181,40 @@ class TrainingConfig:
         changes = {"backbone": self.backbone, "pixels": self.pixels, "marks_hidden": self.marks_hidden}
         return replace(form, **changes)  # type: ignore[arg-type]
 
-    def rate(self, step: int, plateau: Plateau) -> float:
-        """The learning rate of a step, by what the validations so far have shown."""
-        share = plateau.share if self.schedule == "plateau" else cosine(step, self.warm_up, self.steps)
-        return self.learning_rate * share
+    def progress(self, step: int, seconds: float, plateau: Plateau) -> float:
+        return 1.0 if self.schedule == "plateau" and plateau.exhausted else step / self.steps
 
 
 @dataclass(frozen=True)
-class ShardTraining:
+class ShardTraining(Run):
     """A run on views that a folder holds (:mod:`sq_perception.learning.shard_training`)."""
 
-    minutes: float
-    """Training time, that of all parts of a stopped run together."""
-    rate: float
-    """The largest learning rate."""
-    weight_decay: float
     batch: int = 64
+    warm_up: int = 100
+    average: float = 0.998
+    """Some 500 steps."""
+    bfloat16: bool = False
+    validation: int = 200
     seed: int = 0
-    threads: int = 0
-    """Threads of torch; 0 leaves its own choice."""
+    minutes: float = 60.0
+    """Training time, that of all parts of a stopped run together."""
     held: int = 2
     """Shards that are kept for validation."""
-    validation: int = 200
-    """Steps between two validations."""
-    bfloat16: bool = False
-    """Layers before the heads in half the bits, their weights in all: twice as fast where processors have it."""
-    start: str = ""
-    """Weights to begin with: a file, or shipped ones."""
-    device: str = "cpu"
-    """cpu or cuda."""
+
+    def progress(self, step: int, seconds: float, plateau: Plateau) -> float:
+        return seconds / (60 * self.minutes)
 
 
-THING_RUN = ShardTraining(minutes=120.0, rate=8e-4, weight_decay=1e-4)
+THING_RUN = ShardTraining(minutes=120.0, learning_rate=8e-4, weight_decay=1e-4)
 """The network of things."""
-MASK_RUN = ShardTraining(minutes=60.0, rate=3e-3, weight_decay=1e-3)
+MASK_RUN = ShardTraining(minutes=60.0, learning_rate=3e-3, weight_decay=1e-3)
 """The network of masks."""
 
 
 def read(path: str | Path, **changes: Any) -> TrainingConfig:
     """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.
 
-    Raises
-    ------
-    ValueError
-        If there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
+    Raises ValueError if there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
     """
     return TrainingConfig(**{**_values(path), **changes})
 

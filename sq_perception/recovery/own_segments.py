@@ -2,7 +2,7 @@
 
 Rules of geometry take an image apart (:mod:`sq_perception.segmentation.segments`); a network that saw thousands of such
 segments knows better what belongs together.  For a segment a it predicts p_a(x), the probability that the reading of a
-pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask_network`).
+pixel x is of the object that most of a shows (:mod:`sq_perception.learning.networks`).
 
     parted    if the mean of p_a over one of four compact pieces of a (:mod:`sq_perception.segmentation.pieces`) is
               below ``_SURE``, the network is asked about that piece as if it were a segment, and then about pieces

@@ -1,4 +1,4 @@
-"""Household objects in and on furniture, instead of on a plain table.
+"""Household objects in and on furniture, instead of on a plain table; and the room behind a table.
 
 | | the plane that objects stand on is | beside it |
 | --- | --- | --- |
@@ -10,6 +10,12 @@
 | bin | the table | four walls 8 to 30 cm high |
 
 A carton counts as an object too, where its label is visible, though it was not placed; other furniture does not.
+
+Cameras also see what is beyond a table, which is no object on it.  The table of a room ends along a line behind the
+objects, across a direction a that leads away from the camera, turned by up to 70 degrees.  Behind it is a floor, or a
+lower table, 5 to 90 cm below; on its visible part stand up to ten superquadrics, sharp or rounded, with edges of 4 cm
+to 1 m, that may reach above the table: boxes, bins, chairs and shelves.
+
 Metres, optical frame.
 """
 
@@ -27,30 +33,16 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
 
-_MARGIN = (0.02, 0.12)
-"""Metres of free board around all objects."""
-
 
 @dataclass(frozen=True, eq=False)
 class _Place:
-    """The smallest rectangle around all objects along some direction, and a margin.
-
-    Attributes
-    ----------
-    axes : (3, 3)
-        Columns: along its sides, and up.  The second one leads away from the camera.
-    middle : (3,)
-        On the plane that objects stand on.
-    half : (2,)
-        Half its sides.
-    height
-        Height of the highest object, metres.
-    """
+    """The smallest rectangle around all objects along some direction, and a margin."""
 
     axes: np.ndarray
-    middle: np.ndarray
-    half: np.ndarray
-    height: float
+    """(3, 3), columns: along its sides, and up. The second one leads away from the camera."""
+    middle: np.ndarray  # (3,), on the plane that objects stand on
+    half: np.ndarray  # (2,), half its sides
+    height: float  # height of the highest object, metres
 
     @classmethod
     def around(cls, scene: ThingsOnTable, rng: np.random.Generator, turn: float) -> _Place:
@@ -58,8 +50,8 @@ class _Place:
         parts = [placed.parts for placed in scene.placed]
         high = np.max([(each.translation @ axes + each.support(axes.T)).max(axis=0) for each in parts], axis=0)
         low = np.min([(each.translation @ axes - each.support(-axes.T)).min(axis=0) for each in parts], axis=0)
-        low[:2] -= rng.uniform(*_MARGIN, 2)
-        high[:2] += rng.uniform(*_MARGIN, 2)
+        low[:2] -= rng.uniform(0.02, 0.12, 2)  # free board around all objects
+        high[:2] += rng.uniform(0.02, 0.12, 2)
         ground = -scene.plane[3]
         middle = axes @ np.array([*(low + high)[:2] / 2, ground])
         return cls(axes, middle, (high - low)[:2] / 2, float(high[2] - ground))
@@ -149,10 +141,7 @@ def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TA
 
     ``plane`` is the one that they stand on.
 
-    Raises
-    ------
-    ValueError
-        If the objects do not fit into the camera's image, or the furniture always hides all of them.
+    Raises ValueError if the objects do not fit into the camera's image, or the furniture always hides all of them.
     """
     kind = _KINDS[name]
     for _ in range(20):
@@ -174,3 +163,43 @@ def _furnish(scene: ThingsOnTable, parts: list[Superquadric], down: float, is_th
     counts = np.bincount(labels.ravel(), minlength=most + 1)
     placed = tuple(replace(one, pixels=int(counts[one.label])) for one in scene.placed if counts[one.label])
     return replace(scene, depth=depth, labels=labels, placed=placed)
+
+
+_TURN = float(np.deg2rad(70.0))
+
+
+def add_room(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
+    """Return the depth (height, width) of a scene with a room behind its table; its objects and occluders stay."""
+    camera, normal = scene.camera, scene.plane[:3]
+    angle = rng.uniform(-_TURN, _TURN)
+    away = scene.table @ np.array([np.sin(angle), np.cos(angle), 0.0])
+    rows, columns = np.nonzero(scene.labels)
+    if not rows.size:
+        return scene.depth
+    farthest = (camera.unproject(columns, rows, scene.depth[rows, columns]) @ away).max()
+    edge = farthest + rng.uniform(0.03, 0.4)
+    table = plane_depth(scene.plane, camera)
+    v, u = np.nonzero(np.isfinite(table))
+    on_table = np.zeros(table.shape, bool)
+    on_table[v, u] = camera.unproject(u, v, table[v, u]) @ away < edge
+    floor = np.append(normal, scene.plane[3] + rng.uniform(0.05, 0.9))
+    ground = plane_depth(floor, camera)
+    free = np.nonzero((scene.labels == 0) & ~on_table & np.isfinite(ground))
+    if not free[0].size:
+        return scene.depth
+    chosen = rng.integers(free[0].size, size=int(rng.integers(1, 11)))
+    feet = camera.unproject(free[1][chosen], free[0][chosen], ground[free][chosen])
+    standing = Superquadric.stack([_standing_at(foot, edge, away, scene.table, rng) for foot in feet])
+    seen = np.minimum(np.minimum(ground, raycast.render(standing, camera)[0]), scene.wall)
+    return np.where((scene.labels > 0) | on_table, scene.depth, seen)
+
+
+def _standing_at(
+    foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
+) -> Superquadric:
+    """Return a body on the floor below a point, moved from the table if it would reach under its top."""
+    least, most = np.log((0.02, 0.5))
+    size, turn = np.exp(rng.uniform(least, most, 3)), turn_about_up(rng.uniform(0, np.pi))
+    clear = foot @ away - edge - np.hypot(*size[:2])
+    centre = foot - min(clear, 0.0) * away + size[2] * table[:, 2]
+    return Superquadric(size, rng.uniform(0.1, 1.0, 2), centre, quaternions.from_matrix(table @ turn))

@@ -48,10 +48,7 @@ KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
     """Draw a random object, of one of the given kinds or of any.
 
-    Raises
-    ------
-    ValueError
-        If a kind is unknown or none is given.
+    Raises ValueError if a kind is unknown or none is given.
     """
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):

@@ -126,10 +126,7 @@ def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
 
     Faces are seen from both sides.
 
-    Raises
-    ------
-    ValueError
-        For another camera than a pinhole one, or a mesh that is not wholly in front of it.
+    Raises ValueError for another camera than a pinhole one, or a mesh that is not wholly in front of it.
     """
     if not camera.is_pinhole or mesh.vertices[:, 2].min() <= 0:
         raise ValueError("expected a pinhole camera and a mesh in front of it")

@@ -24,7 +24,6 @@ THINGS = {
 }
 """Full edges, exponents, place on the table and turn of each object."""
 SENSOR = "realsense_d435"
-_PITCH = np.deg2rad(35.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,8 @@ class Sample:
 
 def sample(seed: int = 0) -> Sample:
     """Simulate the frame; the seed is that of the sensor's noise."""
-    up = np.array([0.0, -np.cos(_PITCH), -np.sin(_PITCH)])
+    pitch = np.deg2rad(35.0)
+    up = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
     right = np.array([1.0, 0.0, 0.0])
     table = np.stack([right, np.cross(up, right), up], axis=1)
     looked_at = np.array([0.0, 0.0, 0.85])

@@ -14,6 +14,9 @@ A body touches the plane according to its support function h: its centre t has t
 one of its three axes, turned about n by any angle.  The shortest axis always holds; another one is taken only for
 bodies with flat faces (e1 and e2 below 0.5), since an egg does not stand on its tip.
 
+In a crowd most bodies are pushed along the table against another one until they touch.  Convex bodies A and B overlap
+where a point of one's surface lies inside the other; the push ends where no sampled point does any more.
+
 Metres; depth is the z coordinate, NaN where nothing is seen.
 """
 
@@ -30,29 +33,17 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
 
 THESIS_SIZE = (25 / 255, 75 / 255)
-
 TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-MAX_TABLE_BODIES = 10
-
-_ROLL = float(np.deg2rad(5.0))
-
+MAX_TABLE_BODIES, MOST = 10, 12
+"""Most bodies of a scene and of a crowd."""
 
 @dataclass(frozen=True)
 class Scene:
-    """Bodies and the camera that sees them.
+    """Bodies and the camera that sees them."""
 
-    Attributes
-    ----------
-    bodies : Superquadric
-        A batch (n,) in the optical frame of the camera, NumPy.
-    camera : Camera
-    plane : (4,) or None
-        Height above the table = n.p + d in the optical frame, n up; None without a table.
-    """
-
-    bodies: Superquadric
+    bodies: Superquadric  # a batch (n,) in the optical frame of the camera, NumPy
     camera: Camera
-    plane: np.ndarray | None
+    plane: np.ndarray | None  # (4,), height above the table = n.p + d in the optical frame, n up; None without a table
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
         """Render depth float32 (height, width), NaN for no surface, and labels int32, k + 1 for body k, 0 elsewhere."""
@@ -82,10 +73,8 @@ def thesis_scene(rng: np.random.Generator) -> Scene:
 def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:
     """Draw ``count`` random bodies side by side on a table, all wholly inside the image.
 
-    Raises
-    ------
-    ValueError
-        If ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its image.
+    Raises ValueError if ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its
+    image.
     """
     if not 1 <= count <= MAX_TABLE_BODIES:
         raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
@@ -124,7 +113,8 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
 
 def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
     """Return the plane (4,) of a table that the camera looks down on, at a distance along its axis."""
-    far, down, roll = rng.uniform(*distance), rng.uniform(*pitch), rng.uniform(-_ROLL, _ROLL)
+    most = float(np.deg2rad(5.0))
+    far, down, roll = rng.uniform(*distance), rng.uniform(*pitch), rng.uniform(-most, most)
     normal = -np.array([np.cos(down) * np.sin(roll), np.cos(down) * np.cos(roll), np.sin(down)])
     return np.append(normal, far * np.sin(down))
 
@@ -164,3 +154,62 @@ def inside_image(body: Superquadric, camera: Camera, border: float = 0.0) -> boo
     pixels = camera.project(corners)
     limit = np.array([camera.width, camera.height]) - 1 - border
     return bool((pixels >= border).all() and (pixels <= limit).all())
+
+
+def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
+    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.
+
+    Raises ValueError if ``count`` is not 1 to 12, or the bodies do not fit into the image.
+    """
+    if not 1 <= count <= MOST:
+        raise ValueError(f"count: expected 1 to {MOST} bodies, got {count}")
+    for _ in range(10):
+        plane = table_plane(rng, (0.5, 1.2), tuple(np.deg2rad([30.0, 65.0])))
+        bodies: list[_Placed] = []
+        for _ in range(200):
+            drawn = resting_body(rng, plane, 0.25)[0]
+            if not inside_image(drawn, camera):
+                continue
+            body = _Placed.of(drawn, rng)
+            if bodies and rng.random() < 0.7:
+                body = _push(body, bodies[rng.integers(len(bodies))], plane[:3])
+            if not any(map(body.overlaps, bodies)) and inside_image(body.body, camera):
+                bodies.append(body)
+            if len(bodies) == count:
+                return Scene(Superquadric.stack([placed.body for placed in bodies]), camera, plane)
+    raise ValueError(f"no room for {count} bodies in an image of {camera.width} x {camera.height} pixels")
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """A body with points (n, 3) of its surface."""
+
+    body: Superquadric
+    surface: np.ndarray
+
+    @classmethod
+    def of(cls, body: Superquadric, rng: np.random.Generator) -> _Placed:
+        return cls(body, body.sample_surface(1500, rng, oversampling=2))
+
+    def move(self, by: np.ndarray) -> _Placed:
+        return _Placed(self.body.transformed(np.array([0.0, 0.0, 0.0, 1.0]), by), self.surface + by)
+
+    def overlaps(self, other: _Placed) -> bool:
+        if np.linalg.norm(self.body.translation - other.body.translation) > np.linalg.norm(
+            self.body.size
+        ) + np.linalg.norm(other.body.size):
+            return False
+        return bool((self.body.gauge(other.surface) < 1).any() or (other.body.gauge(self.surface) < 1).any())
+
+
+def _push(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
+    """Push a body along the table, straight towards the other one or away from it, until they just touch."""
+    way = body.body.translation - other.body.translation
+    way = way - (way @ normal) * normal
+    length = float(np.linalg.norm(way))
+    way = way / length if length > 0 else np.cross(normal, [0.0, 0.0, 1.0])
+    near, far = -length, float(np.linalg.norm(body.body.size) + np.linalg.norm(other.body.size))
+    while far - near > 2e-4:
+        middle = 0.5 * (near + far)
+        near, far = (middle, far) if body.move(middle * way).overlaps(other) else (near, middle)
+    return body.move(far * way)

@@ -1,9 +1,9 @@
 """Segments of simulated scenes, with the truth of which readings belong to their object: training data.
 
 Objects on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
-(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or
-crowds of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by a known
-sensor or by a random one (:mod:`~sq_perception.simulation.thing_sensing`); many images are cropped, so that their
+(:mod:`~sq_perception.simulation.furniture`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or
+crowds of superquadrics (:mod:`~sq_perception.simulation.scenes`), before a random camera, are measured by a known
+sensor or by a random one (:mod:`~sq_perception.simulation.thing_views`); many images are cropped, so that their
 borders cut objects.  Each image is segmented as in recovery, and each segment becomes a
 :class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the one that most of its pixels show; a
 segment that shows table, furniture or room at half of its pixels, and no object at 30 % of them, has none.  A reading
@@ -27,34 +27,22 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.segmentation import pieces, segments
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
+from sq_perception.simulation import furniture, scenes, sensor_noise, thing_views
 from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 
 NO, YES, UNKNOWN = 0, 1, 2
-_SENSORS = ("realsense_d435", "kinect_v1", "realsense_d435", "kinect_v1", "azure_kinect", "zed")
-_WIDTHS = (160, 320, 640, 1280)
-"""Pixels per row, and the share of scenes of each."""
-_ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0.65, 0.15)
-"""Degrees that the camera is above the table, and shares of the scenes."""
 _SMEARED, _NO_OBJECT = -1, -2
 """In place of an object's label: what a cell shows that a sensor smeared, and the object of a segment that has none."""
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentViews:
-    """Views of n segments, p x p cells.
+    """Views of n segments, p x p cells."""
 
-    Attributes
-    ----------
-    images : float16 (n, p, p, CHANNELS)
-        As in :class:`~sq_perception.imaging.segment_view.SegmentView`.
-    truth : uint8 (n, p, p)
-        Whether the cell's reading is one of the object: NO, YES, or UNKNOWN where there is none.
-    """
-
-    images: np.ndarray
+    images: np.ndarray  # float16 (n, p, p, CHANNELS), as in :class:`~sq_perception.imaging.segment_view.SegmentView`
     truth: np.ndarray
+    """uint8 (n, p, p), whether the cell's reading is one of the object: NO, YES, or UNKNOWN where there is none."""
 
 
 def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
@@ -100,9 +88,10 @@ def _measure(rng: np.random.Generator) -> _Measured:
     if rng.random() < 0.35:
         true_depth = rng.uniform(1.0, 2.5) * true_depth
     if rng.random() < 0.35:
-        depth = thing_sensing.measure_by_any(true_depth, shown > 0, camera, Stages(), rng)
+        depth = thing_views.measure_by_any(true_depth, shown > 0, camera, Stages(), rng)
     else:
-        depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(true_depth, camera, rng)
+        sensors = ("realsense_d435", "kinect_v1", "realsense_d435", "kinect_v1", "azure_kinect", "zed")
+        depth = sensor_noise.preset(str(rng.choice(sensors))).measured(true_depth, camera, rng)
     window = _cut(shown, rng)
     depth, true_depth, shown = (np.ascontiguousarray(each[window]) for each in (depth, true_depth, shown))
     camera = camera.cropped(window[1].start, window[0].start, depth.shape[1], depth.shape[0])
@@ -113,14 +102,14 @@ def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Draw the true depth (height, width), +inf for no surface, and labels of a random scene."""
     camera, kind = _camera(rng), rng.random()
     if kind < 0.2:
-        depth, shown = crowds.draw_crowd(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
+        depth, shown = scenes.draw_crowd(rng, int(rng.integers(1, scenes.MOST + 1)), camera).render()
         return np.where(np.isnan(depth), np.inf, depth), shown, camera
     if kind < 0.5:
         drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)
         return drawn.depth, drawn.labels, camera
-    elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
-    drawn = things_on_table(rng, camera=camera, elevation=elevation)
-    return room.behind(drawn, rng) if rng.random() < 0.6 else drawn.depth, drawn.labels, camera
+    elevations = (6.0, 20.0), (20.0, 70.0), (70.0, 90.0)
+    drawn = things_on_table(rng, camera=camera, elevation=elevations[rng.choice(3, p=(0.2, 0.65, 0.15))])
+    return furniture.add_room(drawn, rng) if rng.random() < 0.6 else drawn.depth, drawn.labels, camera
 
 
 def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -174,8 +163,8 @@ def _of_pieces(
 
 
 def _camera(rng: np.random.Generator) -> Camera:
-    width = int(rng.choice(_WIDTHS, p=(0.1, 0.1, 0.65, 0.15)))
-    height = width * (9 if width == _WIDTHS[-1] else 12) // 16
+    width = int(rng.choice((160, 320, 640, 1280), p=(0.1, 0.1, 0.65, 0.15)))
+    height = width * (9 if width == 1280 else 12) // 16
     # Focal lengths at VGA of depth cameras, 49 to 73 degrees wide.
     focal = (rng.uniform(430.0, 700.0) if rng.random() < 0.5 else TABLE_CAMERA.fx) * width / TABLE_CAMERA.width
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)

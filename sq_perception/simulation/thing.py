@@ -7,6 +7,11 @@ Its convex hull, which planners need, has the support function
 
 in closed form by :meth:`Superquadric.support`.  An open vessel also has cavities, superquadrics that are removed from
 the union; the hull ignores them.
+
+The user's own objects are meshes, to train a network on besides the simulated household.  A mesh rests on the faces of
+its hull on which it is stable, as often as it would settle there (K. Goldberg et al., "Part pose statistics", 1999, as
+computed by trimesh for uniform density).  Views show the mesh; the network predicts its hull, whose corners are in
+:attr:`Thing.parts` as points.
 """
 
 from __future__ import annotations
@@ -14,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
@@ -52,30 +58,14 @@ class Rest:
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A household object.
+    """A household object."""
 
-    Attributes
-    ----------
-    kind : str
-        One of :data:`household.KINDS <sq_perception.simulation.household.KINDS>`.
-    name : str
-        The family within the kind.
-    parts : Superquadric
-        Batch (k,) in the object's own frame, metres.
-    rests : tuple of Rest
-        How it may lie; their probabilities add up to 1.
-    cavities : Superquadric
-        Batch (m,), m >= 0: cavities, removed from the union.
-    surface : Mesh, optional
-        What is seen in place of the union, where the parts only have its hull.
-    """
-
-    kind: str
-    name: str
-    parts: Superquadric
-    rests: tuple[Rest, ...]
-    cavities: Superquadric
-    surface: Mesh | None = None
+    kind: str  # one of :data:`household.KINDS <sq_perception.simulation.household.KINDS>`
+    name: str  # the family within the kind
+    parts: Superquadric  # batch (k,) in the object's own frame, metres
+    rests: tuple[Rest, ...]  # how it may lie; their probabilities add up to 1
+    cavities: Superquadric  # batch (m,), m >= 0: cavities, removed from the union
+    surface: Mesh | None = None  # what is seen in place of the union, where the parts only have its hull
 
     def support(self, directions: np.ndarray) -> np.ndarray:
         """Return max n.p over the convex hull, in the object's frame, for unit directions (J, 3), shape (J,)."""
@@ -148,3 +138,53 @@ def assemble(
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
+LARGEST, SMALLEST = 1.0, 0.005
+"""Longest edge of the box around an object, metres: others are taken for other units."""
+
+
+def read_things(folder: Path) -> tuple[Thing, ...]:
+    """Read all meshes of a folder, by name.
+
+    Raises ValueError if there are none, one cannot be read or has no faces, or its size is none that one takes in a
+    hand.
+    """
+    paths = sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise ValueError(f"{folder}: expected meshes ({' '.join(SUFFIXES)}), found none")
+    return tuple(_read(path) for path in paths)
+
+
+def _read(path: Path) -> Thing:
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+        mesh.remove_unreferenced_vertices()  # nobody sees them
+        hull = mesh.convex_hull
+        if not hull.volume > 0:
+            raise ValueError("it is flat")  # and trimesh would look for its poses for ever
+        turns, likely = hull.compute_stable_poses()
+    except Exception as error:  # whatever a reader of one of many formats raises
+        raise ValueError(f"{path}: no mesh with a volume: {error}") from error
+    longest = float(np.ptp(hull.vertices, axis=0).max())
+    if not SMALLEST <= longest <= LARGEST:
+        raise ValueError(
+            f"{path}: expected metres, a thing of {SMALLEST} to {LARGEST}; its longest edge is {longest:.4g}"
+        )
+    middle = hull.bounds.mean(axis=0)
+    corners = hull.vertices - middle
+    points = np.zeros((len(corners), 12))
+    points[:, :3], points[:, 3:5], points[:, 5:8], points[:, 11] = 1e-5, 1.0, corners, 1.0
+    order = np.argsort(-likely, kind="stable")
+    # The likeliest are kept: each pose of a finely divided round side is unlikely.
+    kept = order[: np.searchsorted(np.cumsum(likely[order]), 0.99 * likely.sum()) + 1]
+    turns, likely = turns[kept], likely[kept]
+    rests = tuple(
+        Rest(f"face {k}", quaternions.from_matrix(turn[:3, :3]), float(share))
+        for k, (turn, share) in enumerate(zip(turns, likely / likely.sum(), strict=True))
+    )
+    surface = Mesh(np.asarray(mesh.vertices, dtype=float) - middle, np.asarray(mesh.faces))
+    return Thing("union", path.stem, Superquadric.from_flat(points), rests, NO_CAVITY, surface)

@@ -6,7 +6,10 @@ follows.
 
     setting     pose, camera and what is around the object: :mod:`sq_perception.simulation.thing_setting`
     before it   in some images something nearer, which comes in from one side
-    sensor      with what it loses: :mod:`sq_perception.simulation.thing_sensing`
+    sensor      of :mod:`sensor_noise` with random parameters; in some images waves, a side that is lost as one eye
+                hardly sees it, lost edges, contours, dark blobs and bands, objects that are lost but for patches,
+                smoothing.  In half of them what is missing beside the object is filled with what is there.  Last come
+                the camera's :mod:`~sq_perception.simulation.camera_stages`
     mask        too small or too large by up to two pixels, with or without what measured the table, and what nothing
                 measured; of some a part is lost
     image       a border that cuts the object
@@ -18,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,27 +34,12 @@ from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent, shown_step
-from sq_perception.simulation.camera_stages import Stages, aligned, decimated, decimated_camera, draw_stages
+from sq_perception.simulation.camera_stages import Stages, aligned, decimated, decimated_camera, draw_stages, temporal
 from sq_perception.simulation.household import KINDS, draw_thing
+from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 from sq_perception.simulation.thing import Thing
-from sq_perception.simulation.thing_sensing import measure_by_any
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 
-PLANE_GIVEN, TOP_GIVEN = 0.8, 2 / 3
-"""Shares of the views with a plane, and of those of an object on top of something in which it is that top, as often as
-:mod:`sq_perception.recovery.supports` finds it.  Else the object hovers above its plane, and a network that often sees
-that expects it of objects whose lower end is hidden."""
-BEFORE, MOST_BEFORE = 0.25, 0.6
-"""Share of the views with something nearer before the object, and the most of the object that it hides.  Chosen: of the
-objects of household scenes a quarter are hidden by a tenth and more."""
-LOST, MOST_LOST = 0.08, 0.3
-"""Share of the views whose mask has lost what lies beyond a straight line, and the most of the object that it loses.
-Of objects of household scenes that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation."""
-
-_MASK_ERRORS = (-2, -1, 0, 0, 0, 0, 0, 1, 1, 2)
-"""Pixels by which masks are too large, each as often.  Few are too small, as those that are all around are completed
-before a view is made (:func:`sq_perception.recovery.seen_object.completed`), and what a stereo camera widens an edge by
-looks like them."""
 _PIXELS = 64
 """Side of the views: what the network of objects takes."""
 _LEAST_SEEN = 40
@@ -60,27 +49,17 @@ _ATTEMPTS = 50
 
 @dataclass(frozen=True, eq=False)
 class ThingViews:
-    """Views of n objects, p x p pixels.
+    """Views of n objects, p x p pixels."""
 
-    Attributes
-    ----------
-    images : float32 (n, p, p)
-        As :attr:`CanonicalView.with_steps`: z in (0, 1] on the object.
-    planes : float32 (n, 4)
-        The plane n.p + d = 0 of the table in the view's frame and unit, n up; zeros where none is given.
-    extents : float32 (n,)
-        Sides of the views, metres.
-    support : float32 (n, 42)
-        max n.(p - c) over the object's hull for n of :data:`DIRECTIONS`, c = (1/2, 1/2, NEAREST), in sides of the view.
-    kinds : int64 (n,)
-        Index into :data:`household.KINDS`.
-    """
-
-    images: np.ndarray
+    images: np.ndarray  # float32 (n, p, p), as :attr:`CanonicalView.with_steps`: z in (0, 1] on the object
     planes: np.ndarray
-    extents: np.ndarray
+    """float32 (n, 4), the plane n.p + d = 0 of the table in the view's frame and unit, n up; zeros where none is
+    given."""
+    extents: np.ndarray  # float32 (n,), sides of the views, metres
     support: np.ndarray
-    kinds: np.ndarray
+    """float32 (n, 42), max n.(p - c) over the object's hull for n of :data:`DIRECTIONS`, c = (1/2, 1/2, NEAREST), in
+    sides of the view."""
+    kinds: np.ndarray  # int64 (n,), index into :data:`household.KINDS`
 
 
 def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] = ()) -> ThingViews:
@@ -109,13 +88,16 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         stages = draw_stages(rng)
         measured, seen, camera = _measure(setting, stages, rng)
         plane = None
-        below = setting.under if rng.random() < TOP_GIVEN else setting.table
-        if below is not None and rng.random() < PLANE_GIVEN:
+        # Of an object on top of something the plane is that top as often as recovery finds it.  Else the object hovers
+        # above its plane, and a network that often sees that expects it of objects whose lower end is hidden.
+        below = setting.under if rng.random() < 2 / 3 else setting.table
+        if below is not None and rng.random() < 0.8:
             plane = _imprecise(below, setting.parts.translation.mean(axis=0), rng)
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         mask = _mask(measured, seen, camera, setting.table if plane is None else plane, rng)
-        if rng.random() < LOST:
+        # Of household objects that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation.
+        if rng.random() < 0.08:
             mask = _partly(mask, rng)
         # Masks from depth end where nothing was measured, those from colour do not.
         if rng.random() >= 0.5:
@@ -157,7 +139,7 @@ def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tupl
 
 def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return image and mask, some with an occluder from one side: a straight edge, a corner or a round object."""
-    if rng.random() > BEFORE or not seen.any():
+    if rng.random() > 0.25 or not seen.any():
         return depth, seen
     v, u = np.nonzero(seen)
     side = max(np.ptp(u), np.ptp(v)) + 1
@@ -167,7 +149,7 @@ def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Genera
     bow = 0.0 if rng.random() < 0.5 else rng.uniform(-1.0, 4.0)
     other = np.abs((c * down - s * across) / side - rng.uniform(-0.2, 0.2)) ** rng.integers(1, 3)
     reach = (c * across + s * down) / side - bow * other
-    front = np.quantile(reach[seen], 1 - rng.uniform(0, MOST_BEFORE))
+    front = np.quantile(reach[seen], 1 - rng.uniform(0, 0.6))
     thick = rng.uniform(0.1, 0.4) if rng.random() < 0.2 else np.inf
     before = (reach > front) & (reach < front + thick)
     near = depth[seen].min() * rng.uniform(0.6, 0.97)
@@ -186,7 +168,9 @@ def _mask(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
     """Draw a mask as from a segmentation or a person, without readings of the table, as in views of images."""
-    error = int(rng.choice(_MASK_ERRORS))
+    # Few masks are too small, as those that are all around are completed before a view is made
+    # (recovery.seen_object.completed), and what a stereo camera widens an edge by looks like them.
+    error = int(rng.choice((-2, -1, 0, 0, 0, 0, 0, 1, 1, 2)))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:
         brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(error) + 1, 2 * abs(error) + 1))
@@ -212,7 +196,7 @@ def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return mask
     way, rest = rng.uniform(-np.pi, np.pi), mask.copy()
     reach = np.cos(way) * u + np.sin(way) * v
-    lost = reach > np.quantile(reach, 1 - rng.uniform(0, MOST_LOST))
+    lost = reach > np.quantile(reach, 1 - rng.uniform(0, 0.3))
     rest[v[lost], u[lost]] = False
     return rest
 
@@ -238,3 +222,120 @@ def _cut(
         bottom = int(np.clip(v.max() + 1 - share * np.ptp(v), 2, bottom))
     window = np.s_[top:bottom, left:right]
     return measured[window], mask[window], camera.cropped(left, top, right - left, bottom - top)
+
+
+def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
+    """Draw a depth sensor with random parameters around those of :data:`sensor_noise.PRESETS`."""
+    choice = rng.random()
+    if choice < 0.1:
+        return Ideal(rng.uniform(0, 0.001))
+    if choice < 0.35:
+        near = rng.uniform(0.1, 0.3)
+        return TimeOfFlight(near, rng.uniform(3.0, 5.0), rng.uniform(0.0, 2.0), rng.uniform(0.0, 1.0))
+    grazing = rng.uniform(55, 80)
+    shared: dict[str, Any] = {
+        "focal": camera.fx,
+        "baseline": rng.choice([-1.0, 1.0]) * rng.uniform(0.02, 0.12),
+        "step": rng.choice([0.0, 1 / 32, 1 / 8]),
+        "window": (int(rng.choice([1, 3, 5, 7])), int(rng.choice([1, 3, 5]))),
+        "near": 0.1,
+        "far": 10.0,
+        "edge_wander": rng.uniform(0.0, 1.2),
+        "grazing": grazing,
+        "blind": rng.uniform(grazing, 89),
+    }
+    if choice < 0.65:
+        return StructuredLight(**shared)
+    return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 4)))
+
+
+def measure_by_any(
+    depth: np.ndarray, seen: np.ndarray, camera: Camera, stages: Stages, rng: np.random.Generator
+) -> np.ndarray:
+    """Measure a true depth image with a random sensor and these camera stages."""
+    sensor = draw_sensor(camera, rng)
+    frames = [sensor.measured(depth, camera, rng) for _ in range(stages.frames)]
+    measured = temporal(frames, stages.factor, stages.threshold) if len(frames) > 1 else frames[0]
+    if rng.random() < 0.4:
+        measured += _waves(measured.shape, rng) * np.square(measured)
+    if rng.random() < 0.35:
+        measured[seen & _turn_aside(depth, camera, rng)] = np.nan
+    if rng.random() < 0.25:
+        measured[_edges(depth, rng)] = np.nan
+    if rng.random() < 0.1:
+        measured[seen & _contours(depth, seen, rng)] = np.nan
+    if rng.random() < 0.15:
+        measured[seen & _blob(seen, rng)] = np.nan
+    # Of household objects that are half visible, 4 % are measured at less than half of their pixels.
+    if rng.random() < 0.08:
+        measured[seen & _between_patches(seen, rng)] = np.nan
+    if rng.random() < 0.3:
+        measured = _smooth(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
+    if rng.random() < 0.5:
+        filled = ~seen & np.isnan(measured) & np.isfinite(depth)
+        measured[filled] = depth[filled]
+    return stages.processed(measured, seen, camera)
+
+
+def _waves(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Draw smooth errors, metres at 1 m, as calibration and disparity interpolation leave them."""
+    coarse = rng.standard_normal((int(rng.integers(4, 14)), int(rng.integers(4, 14))), dtype=np.float32)
+    sigma = np.float32(0.0005 * 8.0 ** rng.random())
+    return sigma * cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+
+
+def _edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Select most pixels within one to three pixels of a depth step."""
+    inverse = (1 / depth).astype(np.float32)
+    brush = np.ones((3, 3), np.uint8)
+    highest = cv2.dilate(inverse, brush)
+    step: np.ndarray = (highest - cv2.erode(inverse, brush) > 0.06 * highest).astype(np.uint8)
+    wider = int(rng.integers(0, 3))
+    if wider:
+        step = cv2.dilate(step, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * wider + 1, 2 * wider + 1)))
+    return (step > 0) & (rng.random(depth.shape, dtype=np.float32) < rng.uniform(0.4, 1.0))
+
+
+def _contours(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Select thin lines of equal disparity, where some sensors that measure in steps find no match."""
+    inverse = 1 / depth
+    near, far = inverse[seen].max(), inverse[seen].min()
+    lines = rng.uniform(1.5, 6.0) / max(near - far, 1e-6)
+    return (inverse * lines + rng.random()) % 1.0 < rng.uniform(0.03, 0.12)
+
+
+def _turn_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    """Select surfaces that turn away to one side of the image by more than a random angle."""
+    with np.errstate(invalid="ignore"):
+        slope = cv2.Sobel(depth, cv2.CV_64F, 1, 0, ksize=1) * (0.5 * camera.fx) / depth
+        return rng.choice([-1.0, 1.0]) * slope > np.tan(np.deg2rad(rng.uniform(45, 82)))
+
+
+def _blob(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Select a dark label: an ellipse or a band somewhere on the object."""
+    v, u = np.nonzero(seen)
+    at = rng.integers(v.size)
+    side = max(np.ptp(u), np.ptp(v)) + 1
+    down, across = np.indices(seen.shape, dtype=float)
+    way = rng.uniform(0, np.pi)
+    c, s = np.cos(way), np.sin(way)
+    x, y = c * (across - u[at]) + s * (down - v[at]), c * (down - v[at]) - s * (across - u[at])
+    wide = side * rng.uniform(0.03, 0.2)
+    long = np.inf if rng.random() < 0.3 else side * rng.uniform(0.05, 0.3)
+    return np.square(x / long) + np.square(y / wide) < 1
+
+
+def _between_patches(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Select most of an object that is shiny, dark or translucent."""
+    coarse = rng.standard_normal((int(rng.integers(3, 12)), int(rng.integers(3, 12))), dtype=np.float32)
+    field = cv2.resize(coarse, (seen.shape[1], seen.shape[0]), interpolation=cv2.INTER_CUBIC)
+    return field > np.quantile(field[seen], 1 - rng.uniform(0.3, 0.95))
+
+
+def _smooth(measured: np.ndarray, width: int, within: np.ndarray | None) -> np.ndarray:
+    """Average the readings of a window, all of them or only those within a mask."""
+    known = np.isfinite(measured)
+    inner = known if within is None else known & within
+    weight = cv2.blur(inner.astype(np.float32), (width, width))
+    mean = cv2.blur(np.where(inner, measured, np.float32(0)), (width, width)) / np.maximum(weight, np.float32(1e-6))
+    return np.where(inner, mean, measured)

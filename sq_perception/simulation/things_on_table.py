@@ -38,10 +38,8 @@ TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
 
 ELEVATION = (20.0, 70.0)
 """Degrees."""
-_ROLL = float(np.deg2rad(5.0))
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many an object can neither lean nor be stacked where it is tried."""
-_MARGIN = 2.0
 _UP, _DOWN = 128, 129
 """The last of the directions that follow; of those before, opposite ones are half as far apart."""
 _BEARINGS = np.linspace(0, 2 * np.pi, _UP, endpoint=False)
@@ -52,26 +50,14 @@ _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
 
 @dataclass(frozen=True, eq=False)
 class PlacedThing:
-    """One object of a scene.
-
-    Attributes
-    ----------
-    rest
-        How it lies, and how it came there.
-    rotation, translation : (4,), (3,)
-        Optical from the object's frame.
-    label
-        Its value in the label image.
-    pixels
-        How many pixels show it.
-    """
+    """One object of a scene."""
 
     thing: Thing
-    rest: str
+    rest: str  # how it lies, and how it came there
     rotation: np.ndarray
-    translation: np.ndarray
-    label: int
-    pixels: int
+    translation: np.ndarray  # (3,), and the rotation (4,): optical from the object's frame
+    label: int  # its value in the label image
+    pixels: int  # how many pixels show it
 
     @property
     def parts(self) -> Superquadric:
@@ -81,28 +67,15 @@ class PlacedThing:
 
 @dataclass(frozen=True, eq=False)
 class ThingsOnTable:
-    """A scene with its true image and its truth.
-
-    Attributes
-    ----------
-    depth : float64 (height, width)
-        +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
-    labels : int32 (height, width)
-        True masks, 0 for no object.
-    plane : (4,)
-        Height above the table = n.p + d.
-    table : (3, 3)
-        Optical from table frame.
-    wall
-        Depth of the wall behind all of it, metres.
-    """
+    """A scene with its true image and its truth."""
 
     camera: Camera
     depth: np.ndarray
-    labels: np.ndarray
-    plane: np.ndarray
-    table: np.ndarray
-    wall: float
+    """float64 (height, width), +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it."""
+    labels: np.ndarray  # int32 (height, width), true masks, 0 for no object
+    plane: np.ndarray  # (4,), height above the table = n.p + d
+    table: np.ndarray  # (3, 3), optical from table frame
+    wall: float  # depth of the wall behind all of it, metres
     placed: tuple[PlacedThing, ...]
 
 
@@ -148,18 +121,17 @@ def things_on_table(
 
     The camera is ``elevation`` (least, greatest) degrees above the table.
 
-    Raises
-    ------
-    ValueError
-        If ``count`` is not 1 to 8, the camera is no pinhole camera, or the objects do not fit into its image.
+    Raises ValueError if ``count`` is not 1 to 8, the camera is no pinhole camera, or the objects do not fit into its
+    image.
     """
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     wanted = int(rng.integers(1, MOST_THINGS + 1)) if count is None else count
+    roll = float(np.deg2rad(5.0))
     for _ in range(15):
-        look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
+        look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-roll, roll))
         eye = np.array([0.0, 0.0, rng.uniform(0.5, 1.2)])
         resting = _arrange(wanted, look, eye, camera, rng, kinds)
         if resting is not None:
@@ -240,8 +212,9 @@ def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) 
         return False
     corners = np.array([[x, y, -reach[5]] for x in (reach[0], -reach[3]) for y in (reach[1], -reach[4])])
     pixels = camera.project(corners)
-    limit = np.array([camera.width, camera.height]) - 1 - _MARGIN
-    return bool((pixels > _MARGIN).all() and (pixels < limit).all())
+    margin = 2.0
+    limit = np.array([camera.width, camera.height]) - 1 - margin
+    return bool((pixels > margin).all() and (pixels < limit).all())
 
 
 def _seen(

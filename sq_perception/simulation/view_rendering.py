@@ -37,22 +37,14 @@ class Occluder(NamedTuple):
 
     c such that ``share`` of the body's pixels lie beyond the front.  bow = 0 is a straight edge, power 1 a corner,
     power 2 a round object.
-
-    Attributes
-    ----------
-    direction : (n,)
-        Angle of u, radians from the view's x axis.
-    bow, offset, power, thickness : (n,)
-    share : (n,)
-        Share of the body's own pixels that is hidden, 0 to below 1; 0 is no occluder.
     """
 
-    direction: np.ndarray
+    direction: np.ndarray  # (n,), angle of u, radians from the view's x axis
     bow: np.ndarray
     offset: np.ndarray
     power: np.ndarray
     thickness: np.ndarray
-    share: np.ndarray
+    share: np.ndarray  # (n,), share of the body's own pixels that is hidden, 0 to below 1; 0 is no occluder
 
 
 def render_views(
@@ -88,10 +80,7 @@ def render_views(
     bodies : Superquadric
         The batch in the canonical frame of its views.
 
-    Raises
-    ------
-    ValueError
-        For a distance that is not positive, or a share outside of [0, 1).
+    Raises ValueError for a distance that is not positive, or a share outside of [0, 1).
     """
     lower, upper = bodies.bounding_box()
     side = MARGIN * (upper - lower)[:, :2].max(axis=1)

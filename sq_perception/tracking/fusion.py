@@ -49,28 +49,17 @@ that nothing hid, the least sure first look had 2.1 times a later one's."""
 
 
 class Estimate(NamedTuple):
-    """What is known of a body; batch dimensions first.
+    """What is known of a body; batch dimensions first."""
 
-    Attributes
-    ----------
-    state : (..., 12)
-    covariance, lasting : (..., 11, 11)
-        P and M.
-    directions : (..., VIEWS, 3)
-        Unit vectors from the body to the camera of each view, body frame; zero for an entry not used yet.
-    biases, correlations : (..., VIEWS, 11, 11)
-        B and C of each view.
-    used : (..., VIEWS)
-        Number of the observation that used it last; -1: none.
-    """
-
-    state: np.ndarray
+    state: np.ndarray  # (..., 12)
     covariance: np.ndarray
-    lasting: np.ndarray
+    lasting: np.ndarray  # M, and covariance P: (..., 11, 11)
     directions: np.ndarray
+    """(..., VIEWS, 3), unit vectors from the body to the camera of each view, body frame; zero for an entry not used
+    yet."""
     biases: np.ndarray
-    correlations: np.ndarray
-    used: np.ndarray
+    correlations: np.ndarray  # C of each view, and biases B: (..., VIEWS, 11, 11)
+    used: np.ndarray  # (..., VIEWS), number of the observation that used it last; -1: none
 
     @classmethod
     def first(cls, observation: Observation) -> Estimate:

@@ -28,23 +28,13 @@ two millimetres of a household thing, 3 degrees."""
 
 
 class Agreement(NamedTuple):
-    """How n observations agree with their tracks, arrays (n,).
-
-    Attributes
-    ----------
-    agrees, fits : bool
-        As a whole; in sizes and exponents.
-    slid, turned : bool
-        Centre or rotation is elsewhere.
-    excess
-        e^T S^-1 e over its limit, at least 1.
-    """
+    """How n observations agree with their tracks, arrays (n,)."""
 
     agrees: np.ndarray
-    fits: np.ndarray
+    fits: np.ndarray  # in sizes and exponents; agrees: as a whole
     slid: np.ndarray
-    turned: np.ndarray
-    excess: np.ndarray
+    turned: np.ndarray  # the rotation is elsewhere; slid: the centre
+    excess: np.ndarray  # e^T S^-1 e over its limit, at least 1
 
 
 def compare(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement:

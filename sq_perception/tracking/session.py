@@ -43,27 +43,14 @@ one's place, and kept its id, up to 2.7.  Chosen."""
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """One body of a frame, as its consumer gets it.
+    """One body of a frame, as its consumer gets it."""
 
-    Attributes
-    ----------
-    id
-        The id of its track.
-    seen
-        Number of frames that showed the body, this one included.
-    is_fused
-        Whether the numbers are the track's; otherwise they are this frame's own.
-    superquadric : Superquadric
-        A single body in the optical frame.
-    covariance : (11, 11)
-        As in :class:`~sq_perception.tracking.state.Observed`; NaN if the observation's is unknown.
-    """
-
-    id: int
-    seen: int
-    is_fused: bool
-    superquadric: Superquadric
+    id: int  # that of its track
+    seen: int  # number of frames that showed the body, this one included
+    is_fused: bool  # whether the numbers are the track's; otherwise they are this frame's own
+    superquadric: Superquadric  # a single body in the optical frame
     covariance: np.ndarray
+    """(11, 11), as in :class:`~sq_perception.tracking.state.Observed`; NaN if the observation's is unknown."""
 
     @property
     def sigma_size(self) -> np.ndarray:
@@ -73,24 +60,12 @@ class Followed:
 
 @dataclass(frozen=True)
 class Tally:
-    """The counts of a session.
+    """The counts of a session."""
 
-    Attributes
-    ----------
-    tracks
-        Alive now, hidden ones included.
-    births
-        Ids given so far.
-    resets
-        How often time went back.
-    without_pose
-        Frames whose camera pose was wanted and not known.
-    """
-
-    tracks: int = 0
-    births: int = 0
-    resets: int = 0
-    without_pose: int = 0
+    tracks: int = 0  # alive now, hidden ones included
+    births: int = 0  # ids given so far
+    resets: int = 0  # how often time went back
+    without_pose: int = 0  # frames whose camera pose was wanted and not known
 
 
 class TrackingSession:
@@ -144,10 +119,7 @@ class TrackingSession:
         camera, depth
             As in :meth:`Tracker.update`.
 
-        Raises
-        ------
-        ValueError
-            As :meth:`Tracker.update`; nothing has changed then, unless the stamp is before the last one.
+        Raises ValueError as :meth:`Tracker.update`; nothing has changed then, unless the stamp is before the last one.
         """
         rotation, position = state.parse_pose(camera_pose) if is_pose_known else self._pose
         is_back = stamp < self._stamp

@@ -77,40 +77,24 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """What is kept of one track.
-
-    Attributes
-    ----------
-    id, velocity, seen, observation
-        As in :class:`Track`.
-    estimate : Estimate
-    last, agreed
-        Stamps of the last observation, and of the last one that the centre follows.
-    missed
-        Frames in a row, since the last observation, that should have shown it.
-    disagreed, last_error : (11,)
-        Observations in a row that disagreed, and the error of the last one if it did.
-    jumps
-        Observations in a row that were found elsewhere.
-    follows
-        Whether the state is as the last observation has it.
-    answer : (12,) or None
-        The last observation, if it is an old answer that shows no more than that the body is still there.
-    """
+    """What is kept of one track."""
 
     id: int
     estimate: Estimate
     last: float
-    agreed: float
+    agreed: float  # last and agreed: stamps of the last observation, and of the last one that the centre follows
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
     seen: int = 1
-    missed: int = 0
+    missed: int = 0  # frames in a row, since the last observation, that should have shown it
     disagreed: int = 0
     last_error: np.ndarray = field(default_factory=lambda: np.zeros(LENGTH))
-    jumps: int = 0
-    observation: int | None = None
-    follows: bool = True
+    """disagreed and last_error: (11,), observations in a row that disagreed, and the error of the last one if it
+    did."""
+    jumps: int = 0  # observations in a row that were found elsewhere
+    observation: int | None = None  # as in :class:`Track`, and so are id, velocity and seen
+    follows: bool = True  # whether the state is as the last observation has it
     answer: np.ndarray | None = None
+    """(12,), the last observation, if it is an old answer that shows no more than that the body is still there."""
 
     @property
     def is_moving(self) -> bool:

@@ -69,9 +69,10 @@ def test_a_frame_may_be_called_anything(tmp_path, name, monkeypatch):
 def test_a_training_that_is_interrupted_says_so_by_its_code(tmp_path, command, monkeypatch, capsys):
     pytest.importorskip("torch", reason="needs the extra 'train'")
     from sq_perception.learning import shard_training
+    from sq_perception.learning.training import Stopped
 
     def interrupted(*_):
-        raise KeyboardInterrupt
+        raise Stopped("the same command goes on")
 
     monkeypatch.setattr(shard_training, "train", interrupted)
     assert main.main([command, str(tmp_path), "--output", str(tmp_path)]) == 130

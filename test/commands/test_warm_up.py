@@ -11,8 +11,7 @@ from sq_perception.commands import installation
 from sq_perception.fitting import levenberg_marquardt
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
-from sq_perception.simulation.crowds import draw_crowd
-from sq_perception.simulation.scenes import TABLE_CAMERA, table_scene
+from sq_perception.simulation.scenes import TABLE_CAMERA, draw_crowd, table_scene
 
 
 def compiled() -> dict[str, set[object]]:

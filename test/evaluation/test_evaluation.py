@@ -22,7 +22,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint
-from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import thesis_bodies
 

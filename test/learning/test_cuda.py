@@ -12,7 +12,7 @@ import torch
 
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.learning import checkpoint, inference, mask_training, shard_training, thing_training, train
+from sq_perception.learning import checkpoint, inference, shard_training, train
 from sq_perception.learning.dataset import ViewSource, draw_views
 from sq_perception.learning.training_config import MASK_RUN, THING_RUN, ShardTraining, TrainingConfig
 from sq_perception.recovery.recoverer import Recoverer
@@ -60,9 +60,9 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     assert next(checkpoint.load(tmp_path / "model.safetensors").parameters()).device.type == "cpu"
 
 
-@pytest.mark.parametrize("subject", [thing_training.THINGS, mask_training.MASKS], ids=lambda subject: subject.name)
+@pytest.mark.parametrize("subject", [shard_training.THINGS, shard_training.MASKS], ids=lambda subject: subject.name)
 def test_a_run_on_shards_goes_on(tmp_path: Path, subject: shard_training.Subject) -> None:
-    draw, run = (draw_thing_views, THING_RUN) if subject is thing_training.THINGS else (draw_segment_views, MASK_RUN)
+    draw, run = (draw_thing_views, THING_RUN) if subject is shard_training.THINGS else (draw_segment_views, MASK_RUN)
     shard_training.write_views(tmp_path / "views", range(3), lambda rng: draw(4, rng), seed=1)
     config: ShardTraining = replace(run, minutes=0.05, batch=8, held=1, threads=1, device="cuda")
     shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")

@@ -9,8 +9,7 @@ from sq_perception.geometry import Superquadric
 from sq_perception.imaging import canonical_view, raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN
-from sq_perception.learning.dataset import ViewSource, draw_views, wide_bodies
-from sq_perception.learning.disturbance import Disturbance, any_occluder
+from sq_perception.learning.dataset import Disturbance, ViewSource, any_occluder, draw_views, wide_bodies
 from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.simulation import view_rendering
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene, thesis_bodies

@@ -15,13 +15,11 @@ from safetensors.torch import load_file, save_file
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.choices import UNSUPERVISED
-from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
-from sq_perception.learning.disturbance import any_occluder
+from sq_perception.learning.dataset import ViewPool, ViewSource, any_occluder, draw_views
 from sq_perception.learning.losses import Objective
-from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.train import train, validate
+from sq_perception.learning.networks import Regressor, RegressorConfig
+from sq_perception.learning.train import recalibrate, train, validate
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.learning.training_state import recalibrate
 from sq_perception.simulation import view_rendering
 from sq_perception.simulation.scenes import thesis_bodies
 

@@ -15,10 +15,10 @@ from safetensors.numpy import load_file, save_file
 from sq_perception.commands import main
 from sq_perception.files import output_file
 from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
-from sq_perception.learning import checkpoint, mask_training, shard_training
+from sq_perception.learning import checkpoint, shard_training
 from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.network_config import MaskConfig
+from sq_perception.learning.networks import MaskNetwork
 from sq_perception.learning.training_config import MASK_RUN
 from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
 
@@ -42,9 +42,9 @@ def test_the_loss_is_a_weighted_cross_entropy() -> None:
     truth = torch.tensor([[[YES, NO, UNKNOWN]]])
     logits = torch.tensor([[[0.5, -1.0, 7.0]]])
     inside, beside = np.log1p(np.exp(-0.5)), np.log1p(np.exp(-1.0))
-    expected = (inside + mask_training.AROUND * beside) / (1 + mask_training.AROUND)
-    assert float(mask_training.mask_loss(logits, images, truth)) == pytest.approx(expected, rel=1e-6)
-    assert float(mask_training.mask_loss(logits, images, torch.full_like(truth, UNKNOWN))) == 0
+    expected = (inside + shard_training.AROUND * beside) / (1 + shard_training.AROUND)
+    assert float(shard_training.mask_loss(logits, images, truth)) == pytest.approx(expected, rel=1e-6)
+    assert float(shard_training.mask_loss(logits, images, torch.full_like(truth, UNKNOWN))) == 0
 
 
 @pytest.mark.parametrize("config", [MaskConfig(), MaskConfig(pixels=32, widths=(4, 8, 8), blocks=2)], ids=str)
@@ -55,7 +55,7 @@ def test_every_cell_has_a_logit(config: MaskConfig) -> None:
 
 def test_a_training_learns_goes_on_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
-    subject = replace(mask_training.MASKS, network=lambda _: MaskNetwork(SMALL))
+    subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
     config = replace(MASK_RUN, minutes=0.1, batch=8, threads=1, held=1, validation=5)
     first = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
@@ -83,7 +83,7 @@ def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
         return original(none, paths)
 
     monkeypatch.setattr(shard_training, "read_views", read_views)
-    subject = replace(mask_training.MASKS, network=lambda _: MaskNetwork(SMALL))
+    subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
     config = replace(MASK_RUN, batch=2, threads=1, held=1, validation=1)
     for name, memory, expected in (("two", 2.5 * size, 2), ("one", 0.5 * size, 1)):
         read.clear()
@@ -135,7 +135,7 @@ def test_a_shard_of_another_form_is_named(
     path = tmp_path / "views" / "00001.safetensors"
     save_file({**load_file(str(path)), name: wrong}, str(path))
     with pytest.raises(ValueError, match=rf"00001\.safetensors: .*{name}: expected .* got {wrong.dtype}"):
-        shard_training.read_views(mask_training.MASKS.none, sorted((tmp_path / "views").iterdir()))
+        shard_training.read_views(shard_training.MASKS.none, sorted((tmp_path / "views").iterdir()))
 
 
 @pytest.mark.parametrize("filled", [False, True])
@@ -145,14 +145,15 @@ def test_shards_without_a_view_are_named(
     """All of them, or those that are kept for validation."""
     shards(tmp_path / "views", 3, rng)
     for k in range(2 if filled else 3):
-        save_file(vars(mask_training.MASKS.none), str(tmp_path / "views" / f"{k:05d}.safetensors"))
+        save_file(vars(shard_training.MASKS.none), str(tmp_path / "views" / f"{k:05d}.safetensors"))
     assert main.main(["train-masks", str(tmp_path / "views"), "--output", str(tmp_path / "run")]) == 1
     assert "expected views in 00000.safetensors, 00001.safetensors, found none" in capsys.readouterr().err
 
 
 def test_views_of_no_object_have_figures(rng: np.random.Generator) -> None:
     images = rng.random((2, PIXELS, PIXELS, CHANNELS)).astype(np.float16)
-    found = mask_training.validate(MaskNetwork(SMALL), SegmentViews(images, np.full((2, PIXELS, PIXELS), NO, np.uint8)))
+    views = SegmentViews(images, np.full((2, PIXELS, PIXELS), NO, np.uint8))
+    found = shard_training.validate_masks(MaskNetwork(SMALL), views)
     assert found["outliers"] > 0 == found["lost"]
 
 
@@ -166,7 +167,7 @@ def test_a_shard_that_comes_before_those_held_is_trained_on(tmp_path: Path, rng:
         validated.append(views.truth)
         return {}
 
-    subject = replace(mask_training.MASKS, network=lambda _: MaskNetwork(SMALL), validate=validate)
+    subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL), validate=validate)
     config = replace(MASK_RUN, minutes=0.001, batch=2, threads=1, held=1)
     shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     (tmp_path / "later").rename(tmp_path / "views" / "00000.safetensors")
@@ -180,7 +181,7 @@ def test_a_shard_that_comes_before_those_held_is_trained_on(tmp_path: Path, rng:
 
 def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:
     assert main.main(["segment-views", str(tmp_path), "--shards", "1", "--scenes", "2"]) == 0
-    drawn = shard_training.read_views(mask_training.MASKS.none, [tmp_path / "00000.safetensors"])
+    drawn = shard_training.read_views(shard_training.MASKS.none, [tmp_path / "00000.safetensors"])
     again = draw_segment_views(2, np.random.default_rng([0, 0]))
     np.testing.assert_array_equal(drawn.images, again.images)
     np.testing.assert_array_equal(drawn.truth, again.truth)
@@ -204,7 +205,8 @@ def test_weights_of_another_kind_are_refused() -> None:
 
 def test_the_shipped_network_finds_outliers_in_scenes_that_it_has_not_seen() -> None:
     """More than half of them, for a fiftieth of the objects' readings."""
-    found = mask_training.validate(checkpoint.load_masks(), draw_segment_views(12, np.random.default_rng([77, 5])))
+    views = draw_segment_views(12, np.random.default_rng([77, 5]))
+    found = shard_training.validate_masks(checkpoint.load_masks(), views)
     assert found["outliers"] > 0.03
     assert found["left"] < 0.6 * found["outliers"]
     assert found["lost"] < 0.03

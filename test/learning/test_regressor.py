@@ -17,8 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch.nn import functional
 
 from sq_perception.learning import checkpoint
-from sq_perception.learning.backbone import ResNet18
-from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.networks import Regressor, RegressorConfig, ResNet18
 
 COMPACT = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 THESIS = replace(RegressorConfig.thesis(), pixels=64)

@@ -73,7 +73,7 @@ assert "torch" not in sys.modules
 def test_what_needs_torch_says_so(arguments: str, frame: Path) -> None:
     if "thesis" in arguments:
         from sq_perception.learning import checkpoint
-        from sq_perception.learning.regressor import Regressor, RegressorConfig
+        from sq_perception.learning.networks import Regressor, RegressorConfig
 
         checkpoint.save(frame / "thesis.safetensors", Regressor(RegressorConfig.thesis()))
     done = command(arguments, frame)

@@ -20,7 +20,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
-from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.evidence import FrameEvidence

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sq_perception.simulation import room
+from sq_perception.simulation import furniture
 from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_table
 
 
@@ -13,10 +13,10 @@ from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_ta
 def pair(request: pytest.FixtureRequest) -> tuple[ThingsOnTable, np.ndarray]:
     rng = np.random.default_rng(request.param)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(room, "_TURN", 0.0)  # the table ends across y of its own frame
+        patch.setattr(furniture, "_TURN", 0.0)  # the table ends across y of its own frame
         while True:  # until the image shows the room
             scene = things_on_table(rng, 3)
-            depth = room.behind(scene, rng)
+            depth = furniture.add_room(scene, rng)
             if (depth != scene.depth).mean() > 0.1:
                 return scene, depth
 

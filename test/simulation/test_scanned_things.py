@@ -14,10 +14,9 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.learning.shard_training import read_views, write_views
-from sq_perception.learning.thing_training import THINGS
+from sq_perception.learning.shard_training import THINGS, read_views, write_views
 from sq_perception.simulation.rendering import Mesh, render_mesh
-from sq_perception.simulation.scanned_things import read_things
+from sq_perception.simulation.thing import read_things
 from sq_perception.simulation.thing_setting import draw_setting
 from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
 

@@ -15,9 +15,8 @@ from sq_perception.imaging.canonical_view import COVERED, FLUSH, HIDDEN, NEAREST
 from sq_perception.imaging.raycast import render
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.rendering import render_things
-from sq_perception.simulation.thing_sensing import draw_sensor
 from sq_perception.simulation.thing_setting import Setting, draw_setting
-from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
+from sq_perception.simulation.thing_views import draw_sensor, draw_thing_views, support_in_view
 
 NOTHING = Superquadric.stack([])
 

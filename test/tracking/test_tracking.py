@@ -28,7 +28,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
-from sq_perception.simulation.sensor_model import Ideal
+from sq_perception.simulation.sensor_noise import Ideal
 from sq_perception.tracking import association, gating, state, visibility
 from sq_perception.tracking import tracker as tracker_module
 from sq_perception.tracking.tracker import FORGET_AFTER, Tracker, TrackState
