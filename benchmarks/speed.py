@@ -153,9 +153,10 @@ def kinds(frame: Any, seconds: float) -> dict[str, float]:
     multiplying = multiplied.__code__.co_filename, multiplied.__code__.co_firstlineno
     spent = dict.fromkeys(KINDS, 0.0)
     statistics: dict[tuple[str, int, str], tuple[int, int, float, float, Any]] = pstats.Stats(profile).stats  # type: ignore[attr-defined]
-    for (file, line, _), (_, _, own, _, _) in statistics.items():
+    for (file, line, name), (_, _, own, _, _) in statistics.items():
         spent["compiled"] += own if (file, line) in kernels else 0.0
-        spent["libraries"] += own if file == "~" or (file, line) == multiplying else 0.0
+        is_library = file == "~" and "builtins." not in name
+        spent["libraries"] += own if is_library or (file, line) == multiplying else 0.0
     spent["interpreter"] = max(seconds - sum(spent.values()), 0.0)
     return {kind: own / sum(spent.values()) for kind, own in spent.items()}
 
