@@ -32,7 +32,7 @@ class Terms(NamedTuple):
     then in first order. Rendered residuals up to ``dead_zone`` noise levels count as 0: what rounding may do.
     ``outline_stiffness`` is 1/sigma_o; ``plane`` is n and d of n.x + d = height, ``expected`` three half sizes; a
     stiffness or price of 0 switches its term off.  The rows of ``hull_directions`` are n_j, of ``hull_root`` those of
-    W; no rows switch that term off.
+    W, ``hull_freedom`` is nu of its errors; no rows switch that term off.
     """
 
     huber: float = 3.0
@@ -56,6 +56,7 @@ class Terms(NamedTuple):
     hull_directions: np.ndarray = np.empty((0, 3))
     hull_support: np.ndarray = np.empty(0)
     hull_root: np.ndarray = np.empty((0, 0))
+    hull_freedom: float = math.inf
 
 
 @inline_kernel

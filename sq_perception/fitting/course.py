@@ -124,6 +124,7 @@ def _beside(hull: HullPrior, terms: Terms) -> Terms:
         hull_directions=np.array(hull.directions, float, order="C"),
         hull_support=np.array(hull.support, float, order="C"),
         hull_root=hull.root(),
+        hull_freedom=float(hull.freedom),
         taper_stiffness=1 / TAPER_SIGMA,
     )
 

@@ -18,14 +18,12 @@ their second moments about the result, and so does a predicted hull that the bod
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
-from sq_perception.fitting.hull_prior import HullPrior, near_axes
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.priors import hull_cost, hull_distances
 from sq_perception.fitting.rays import DEPTH, SAMPLE, WEIGHT, Rays
@@ -37,65 +35,58 @@ UNTAPERED = 11
 """Entries of a step without those of the taper: what a covariance is of."""
 WEAK_SHARE = 0.15
 """Standard deviation of a half size, as a share of it, above which it is called undetermined."""
-_PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
-"""Standard deviations of the prior: a factor e, half of the range of an exponent, a radian."""
+_PRIOR = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+"""Standard deviations of the prior: a factor e, half of the range of an exponent, one size, a radian."""
+_NEAR_AXIS = 16
+"""Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
+degrees apart."""
 
 
-def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: HullPrior | None = None) -> np.ndarray:
+def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.ndarray:
     """Covariance (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
 
     (13, 13), of the tapers too, where the terms let bodies taper.
-    ``outline`` is the standard deviation of the outline, metres, ``hull`` the prediction that the terms hold.
+    ``outline`` is the standard deviation of the outline, metres.
     """
     stride = max(1, len(rays.hits) // SAMPLE)
     terms = terms._replace(outline_stiffness=1 / outline)
-    length = float(state.parameters[:3].sum()) / 3
-    prior = (
-        np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3) ** 2
-    )
-    unknowns = len(prior) if terms.taper_stiffness == 0.0 else STEP_LENGTH
-    prior = np.append(prior, np.zeros(STEP_LENGTH - len(prior)))  # that of the taper is among the terms
-    freedom = math.inf if hull is None else float(hull.freedom)  # an int would have it compiled again
-    information = _information(rays.hits, rays.free, stride, terms, state.parameters, state.rotation, prior, freedom)
-    covariance = _inverse(information[:unknowns, :unknowns], float(prior[:11].min()))
-    units = np.concatenate([state.parameters[:3], np.ones(unknowns - 3)])
-    covariance = units[:, None] * covariance * units
-    covariance = (covariance + covariance.T) / 2
-    return covariance if hull is None else covariance + _beside(state, terms, unknowns)
+    return np.asarray(_covariance(rays.hits, rays.free, stride, terms, state.parameters, state.rotation))
 
 
 @kernel
-def _information(
-    hits: np.ndarray,
-    free: np.ndarray,
-    stride: int,
-    terms: Terms,
-    parameters: np.ndarray,
-    rotation: np.ndarray,
-    prior: np.ndarray,
-    freedom: float,
+def _covariance(
+    hits: np.ndarray, free: np.ndarray, stride: int, terms: Terms, parameters: np.ndarray, rotation: np.ndarray
 ) -> np.ndarray:
-    """The inverse (13, 13) of the covariance, with ``prior`` (13,) the diagonal of P and ``freedom`` nu.
-
-    Each ``stride``-th ray counts for those between.
-    """
+    """Covariance (k, k) as by :func:`covariance_at`; each ``stride``-th ray counts for those between."""
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     of_hull = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     hits, free = hits[::stride].copy(), free[::stride].copy()
     hits[:, WEIGHT] *= stride
     free[:, WEIGHT] *= stride
     cost = evaluate(RENDERED, hits, free, terms, parameters, rotation, hits[:, DEPTH].copy(), sums)
-    hull = hull_cost(terms, parameters, rotation, of_hull) if terms.hull_directions.shape[0] > 0 else 0.0
+    has_hull = terms.hull_directions.shape[0] > 0
+    hull = hull_cost(terms, parameters, rotation, of_hull) if has_hull else 0.0
     variance = max(1.0, (cost - hull) / hits[:, WEIGHT].sum())
-    vaguer = 1.0 + hull / freedom
+    vaguer = 1.0 + hull / terms.hull_freedom
+    unknowns = UNTAPERED if terms.taper_stiffness == 0.0 else STEP_LENGTH
+    prior = np.zeros(unknowns)  # that of the taper is among the terms
+    prior[:UNTAPERED] = 1.0 / np.square(_PRIOR)
+    prior[5:8] /= np.square((parameters[0] + parameters[1] + parameters[2]) / 3.0)
     information = np.diag(prior)
-    for j in range(STEP_LENGTH):
+    for j in range(unknowns):
         for k in range(j + 1):
             information[j, k] += (sums[j, k] - of_hull[j, k]) / variance + of_hull[j, k] / vaguer
             information[k, j] = information[j, k]
-    return information
+    covariance = _inverse(information, prior[:UNTAPERED].min())
+    covariance[:3] *= parameters[:3].copy().reshape(3, 1)
+    covariance[:, :3] *= parameters[:3]
+    covariance = 0.5 * (covariance + covariance.T)
+    if has_hull:
+        _add_distances(terms, parameters, rotation, covariance)
+    return covariance
 
 
+@kernel
 def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     """The inverse of an information matrix (k, k) with no eigenvalue below ``least``, the smallest of its prior.
 
@@ -104,26 +95,26 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     """
     inverse = np.linalg.inv(information)
     variances = np.diag(inverse)
-    if (variances > 0).all() and (variances < 2 / least).all():
+    if (variances > 0.0).all() and (variances < 2.0 / least).all():
         return inverse
     values, axes = np.linalg.eigh(information)
-    return np.asarray((axes / np.maximum(values, least)) @ axes.T)
+    return (axes / np.maximum(values, least)) @ axes.T
 
 
-def _beside(state: State, terms: Terms, unknowns: int) -> np.ndarray:
-    """Second moments (unknowns, unknowns) of sizes and centre that a body's distance to a predicted hull adds.
+@kernel
+def _add_distances(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, covariance: np.ndarray) -> None:
+    """Add the second moments of sizes and centre that a body's distance to a predicted hull adds.
 
     The body does not match the hull of a thing that is no superquadric, nor a wrong prediction.  Each end of an axis
     errs by the differences in the directions near to it: whether both ends do so alike or apart, neither half their
     sum, the size, nor half their difference, the centre, errs by more.
     """
-    near = near_axes(terms.hull_directions, state.rotation)
-    off = hull_distances(terms, state.parameters, state.rotation)
-    square = off**2 @ near / near.sum(axis=0)
-    moments = np.zeros((unknowns, unknowns))
-    moments[0:3, 0:3] = np.diag(square)
-    moments[5:8, 5:8] = (state.rotation * square) @ state.rotation.T
-    return moments
+    near = (terms.hull_directions @ rotation) ** _NEAR_AXIS
+    off = hull_distances(terms, parameters, rotation)
+    square = (off * off) @ near / near.sum(axis=0)
+    for k in range(3):
+        covariance[k, k] += square[k]
+    covariance[5:8, 5:8] += (rotation * square) @ rotation.T
 
 
 class Alternative(NamedTuple):

@@ -22,9 +22,6 @@ import numpy as np
 PULL_SHARE = 0.07
 """Standard deviation, as a share of the thing's extent, of the pull on a body that misfits twice as much as the best
 do.  On 408 things of benchmarks/household_things, seeds from 5000, 0.05 to 0.14 change IoU by less than 0.2 %."""
-_NEAR_AXIS = 16
-"""Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
-degrees apart."""
 MODEL_SHARE = 0.02
 """Difference between a thing's support function and that of the nearest superquadric, as a share of the thing's extent.
 Chosen on benchmarks/household_things, where 0.01 and 0.03 cost 0.2 % of IoU."""
@@ -74,8 +71,3 @@ class HullPrior:
         """(S + model error)^-1."""
         model = MODEL_SHARE * self.extent
         return np.linalg.inv(self.covariance + model**2 * np.eye(len(self.support)))
-
-
-def near_axes(directions: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """Nearness (J, 3), 0 to 1, of directions (J, 3) to either end of each axis, the columns of ``rotation`` (3, 3)."""
-    return np.asarray((directions @ rotation) ** _NEAR_AXIS)

@@ -238,7 +238,7 @@ class Solution:
     @cached_property
     def _with_taper(self) -> np.ndarray:
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
-        return covariance_at(self.state, self.rays, terms, outline, self.problem.hull)
+        return covariance_at(self.state, self.rays, terms, outline)
 
     def noted(self, **changed: Any) -> Solution:
         """The solution with other fields than its problem, body and rays changed: its valley is the same."""

@@ -48,20 +48,21 @@ def conjugate(quaternion: Array) -> Array:
 
 def to_matrix(quaternion: Array) -> Array:
     """Return rotation matrices (..., 3, 3) of quaternions (..., 4) of any non-zero length (thesis, equation 3.8)."""
-    q = normalize(quaternion)
-    x, y, z, w = _components(q)
+    x, y, z, w = _components(quaternion)
+    square = x * x + y * y + z * z + w * w
+    s = 2 / square if not _is_one(quaternion) or square > 0 else math.nan
     entries = [
-        1 - 2 * (y * y + z * z),
-        2 * (x * y - z * w),
-        2 * (x * z + y * w),
-        2 * (x * y + z * w),
-        1 - 2 * (x * x + z * z),
-        2 * (y * z - x * w),
-        2 * (x * z - y * w),
-        2 * (y * z + x * w),
-        1 - 2 * (x * x + y * y),
+        1 - s * (y * y + z * z),
+        s * (x * y - z * w),
+        s * (x * z + y * w),
+        s * (x * y + z * w),
+        1 - s * (x * x + z * z),
+        s * (y * z - x * w),
+        s * (x * z - y * w),
+        s * (y * z + x * w),
+        1 - s * (x * x + y * y),
     ]
-    return _join(entries, q).reshape((*q.shape[:-1], 3, 3))
+    return _join(entries, quaternion).reshape((*quaternion.shape[:-1], 3, 3))
 
 
 def from_matrix(matrix: Array) -> Array:
@@ -159,7 +160,7 @@ def _components(array: Array) -> Any:
 def _join(components: list[Any], *parts: Array) -> Array:
     """Join components that were computed from those of ``parts`` in one array."""
     if type(components[0]) in (float, int):
-        return np.array(components, dtype=np.result_type(*parts))
+        return np.array(components, dtype=np.result_type(*parts, np.float32))
     return array_namespace(*parts).stack(components, axis=-1)
 
 

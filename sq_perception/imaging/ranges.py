@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.imaging.camera import Camera
 
 RANGES = (
@@ -25,6 +26,8 @@ _POINTS, _COUNTED, _DRAWS = 2500, 600, 150
 """About so many readings are looked at, so many of them count for a drawn plane, and so many planes are drawn."""
 _TOLERANCE = 0.006
 """Of a plane, as a share of the distance."""
+_LEAST_VOLUME, _REFITS = 1e-4, 4
+"""Of three rays that a plane is drawn through, and how often it is fitted to the points on it."""
 _SHARE, _MORE = 0.25, 1.2
 """Of the readings on the plane of ranges, and the ratio to those on the plane of z."""
 _LEVER = 0.01
@@ -62,16 +65,46 @@ def _on_plane(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Which of the points z * rays lie on the plane that has most of them."""
     rng = np.random.default_rng(0)
     some = rng.permutation(z.size)[:_COUNTED]
-    drawn = rng.integers(z.size, size=(_DRAWS, 3))
-    drawn = drawn[np.abs(np.linalg.det(rays[drawn])) > 1e-4]
-    if not len(drawn):
-        return np.zeros(z.size, bool)
-    planes = np.linalg.solve(rays[drawn], 1 / z[drawn][..., None])[..., 0]
-    counts = np.count_nonzero(np.abs(planes @ rays[some].T * z[some] - 1) < _TOLERANCE, axis=1)
-    plane = planes[counts.argmax()]
-    for _ in range(4):
-        on = np.abs(rays @ plane * z - 1) < _TOLERANCE
-        if np.count_nonzero(on) < 3:
+    return np.asarray(_search(rays, z, some, rng.integers(z.size, size=(_DRAWS, 3))))
+
+
+@kernel
+def _search(rays: np.ndarray, z: np.ndarray, some: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """:func:`_on_plane` by planes a, a.r = 1/z, through three drawn points each, and the best one's least squares."""
+    plane, most = np.zeros(3), 0
+    for k in range(drawn.shape[0]):
+        i, j, m = drawn[k]
+        normals = np.empty((3, 3))
+        normals[0] = _cross(rays[j], rays[m])
+        normals[1] = _cross(rays[m], rays[i])
+        normals[2] = _cross(rays[i], rays[j])
+        volume = (rays[i] * normals[0]).sum()
+        if abs(volume) <= _LEAST_VOLUME:
+            continue
+        a = (normals[0] / z[i] + normals[1] / z[j] + normals[2] / z[m]) / volume
+        count = 0
+        for n in some:
+            count += abs((a[0] * rays[n, 0] + a[1] * rays[n, 1] + a[2] * rays[n, 2]) * z[n] - 1.0) < _TOLERANCE
+        if count > most:
+            plane, most = a, count
+    on = np.zeros(z.size, np.bool_)
+    for step in range(_REFITS + 1):
+        square, right = np.zeros((3, 3)), np.zeros(3)
+        for n in range(z.size):
+            x, y, w = rays[n, 0] * z[n], rays[n, 1] * z[n], rays[n, 2] * z[n]
+            on[n] = abs(plane[0] * x + plane[1] * y + plane[2] * w - 1.0) < _TOLERANCE
+            if on[n]:
+                row = (x, y, w)
+                for k in range(3):
+                    right[k] += row[k]
+                    for m in range(3):
+                        square[k, m] += row[k] * row[m]
+        if step == _REFITS or np.count_nonzero(on) < 3:
             break
-        plane = np.linalg.lstsq(rays[on] * z[on, None], np.ones(np.count_nonzero(on)), rcond=None)[0]
-    return np.abs(rays @ plane * z - 1) < _TOLERANCE
+        plane[:] = np.linalg.solve(square, right)
+    return on
+
+
+@inline_kernel
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

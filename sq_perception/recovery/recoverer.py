@@ -181,6 +181,7 @@ class Recoverer:
         image = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
         self.recover(image, camera, (index >= 0).astype(np.int32))
         self.recover(image, camera)
+        _doubt(np.ones_like(image), camera)  # of a wall, which spans enough of the image
         image[::2] = np.nan
         hole_filling.fill(image)
 
