@@ -1,18 +1,16 @@
-"""Where a gripper may take the things on the table, the most probable grasp of each."""
+"""Where a gripper may take the things on the table, by their handles and rims too, the most probable grasp of each."""
 
 import numpy as np
 
 import sq_perception as sq
 from sq_perception.grasping.gripper import PANDA
-from sq_perception.grasping.planner import grasps
+from sq_perception.grasping.planner import grasps_of
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.simulation.sample import sample
 
 frame = sample()
-found = sq.Recoverer().recover(frame.depth, frame.camera)
-bodies = sq.Superquadric.stack([body.superquadric for body in found.recovered])
-covariances = np.array([body.covariance for body in found.recovered])
-plan = grasps(bodies, PANDA, covariances, Surroundings.of_image(frame.depth, frame.camera, found.plane))
+found = sq.Recoverer().recover(frame.depth, frame.camera, options=sq.RecoveryOptions(parts=True))
+plan = grasps_of(found.recovered, PANDA, Surroundings.of_image(frame.depth, frame.camera, found.plane))
 best = {grasp.body: grasp for grasp in reversed(plan.grasps)}
 for grasp in best.values():
     place = np.round(grasp.position, 3)

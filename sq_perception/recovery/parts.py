@@ -63,6 +63,8 @@ _JOINT_SPREAD = 2.0
 """Factor of the covariance of a part: where one ends and the next one begins is not seen."""
 _FINE = 1.3
 """L of good bodies, mostly: where one leaves no more than the price above it, two are not sought."""
+_SAME = 0.9
+"""IoU of the pixels of two pieces from which on they have one body."""
 
 
 class Weight(NamedTuple):
@@ -116,6 +118,9 @@ class Search:
         self.parts: Parts | None = None
         """The best ones so far; None where one body is the shorter description."""
         self._divisions: Iterator[list[SeenObject]] = iter(())
+        self._fitted: list[tuple[SeenObject, Fit]] = []
+        self._fresh: list[SeenObject] = []
+        self._again: list[Fit] = []
         is_enough = alone.status != Status.FAILED and obj.pixels >= 2 * MIN_PIXELS
         if not (is_enough and camera.is_pinhole and np.isfinite(alone.noise)):
             return
@@ -127,22 +132,35 @@ class Search:
             self._divisions = (list(_make_objects(obj, depth, camera, each)) for each in pieces)
 
     def next_pieces(self) -> list[SeenObject]:
-        """Return the pieces of the next division; none where the search has ended."""
-        return next(self._divisions, [])
+        """Return the pieces of the next division that have no body yet; none where the search has ended."""
+        for pieces in self._divisions:
+            known = [(piece, [fit for other, fit in self._fitted if _is_same(piece, other)]) for piece in pieces]
+            self._fresh = [piece for piece, fits in known if not fits]
+            self._again = [fits[0] for _, fits in known if fits]
+            if self._fresh:
+                break
+        else:
+            self._fresh = []
+        return self._fresh
 
     def judge(self, fits: Sequence[Fit]) -> None:
-        """Keep the fits of a division's pieces, or end the search if those at hand are the shorter description."""
-        fits = [fit for fit in fits if fit.status != Status.FAILED]
+        """Keep a division, given the bodies of its fresh pieces, or end the search if it is no shorter."""
+        self._fitted += zip(self._fresh, fits, strict=True)
+        fits = [fit for fit in (*fits, *self._again) if fit.status != Status.FAILED]
         if len(fits) > 1:
             weight = self._evidence.weigh(fits)
             left = weight.misfit + _PRICE * (len(fits) - 1)
             if left < self._least:
                 self._least = left
                 milliseconds = sum(fit.milliseconds for fit in fits)
-                fits = [replace(fit, covariance=_JOINT_SPREAD * fit.covariance) for fit in fits]
-                self.parts = Parts.of(fits, weight.shares, self._noise, milliseconds)
+                wide = [replace(fit, covariance=_JOINT_SPREAD * fit.covariance) for fit in fits]
+                self.parts = Parts.of(wide, weight.shares, self._noise, milliseconds)
                 return
         self._divisions = iter(())
+
+
+def _is_same(one: SeenObject, other: SeenObject) -> bool:
+    return np.count_nonzero(one.mask & other.mask) > _SAME * np.count_nonzero(one.mask | other.mask)
 
 
 def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:

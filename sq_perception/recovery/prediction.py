@@ -46,14 +46,14 @@ class Prediction:
 
 
 def of_hulls(
-    views: Sequence[CanonicalView], planes: Sequence[np.ndarray | None], network: ThingPredictor
+    views: Sequence[CanonicalView], planes: Sequence[np.ndarray | None], network: ThingPredictor, mirror: bool
 ) -> list[Prediction]:
-    """Predictions of hulls from views and the support planes (4,) under them, optical frame."""
+    """Predictions of hulls from views, and from their mirror images, and the support planes (4,), optical frame."""
     shown = np.stack([view.with_steps for view in views])
     known = zip(views, planes, strict=True)
     below = np.stack([np.zeros(4) if plane is None else view.plane_to_canonical(plane) for view, plane in known])
     extents = np.array([view.extent for view in views])
-    found = network.predict(shown, below, extents)
+    found = network.predict(shown, below, extents, mirror)
     return _answered(views, lambda: found)
 
 

@@ -325,7 +325,9 @@ class Recoverer:
             return None
         return self._load_network(readings.camera.is_pinhole and readings.options.method == "auto")
 
-    def _predict(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
+    def _predict(
+        self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions, mirror: bool = True
+    ) -> list[SeenObject]:
         """The objects with their predictions; with ``auto``, bodies are predicted only once a fit asks for one."""
         views = [obj.shown for obj in objects if obj.shown is not None]
         if not views:
@@ -333,7 +335,7 @@ class Recoverer:
         if isinstance(network, inference.ThingPredictor):
 
             def of_some(some: Sequence[int]) -> list[Prediction]:
-                return prediction.of_hulls([views[k] for k in some], [objects[k].plane for k in some], network)
+                return prediction.of_hulls([views[k] for k in some], [objects[k].plane for k in some], network, mirror)
 
             found = self._shared(of_some, range(len(views)))
         else:
@@ -360,7 +362,7 @@ class Recoverer:
             pieces = [piece for some in divided for piece in some]
             pieces = self._mapped(lambda each: seen_object.viewed(each, depth, camera, config), pieces)
             if network is not None:
-                pieces = self._predict(pieces, network, options)
+                pieces = self._predict(pieces, network, options, mirror=False)
             found = iter(self._mapped(lambda each: methods.fit_view(each, depth, camera, options, deadline), pieces))
             for search, some in zip(searches, divided, strict=True):
                 if some:
