@@ -160,7 +160,7 @@ class Search:
 
 
 def _is_same(one: SeenObject, other: SeenObject) -> bool:
-    return np.count_nonzero(one.mask & other.mask) > _SAME * np.count_nonzero(one.mask | other.mask)
+    return bool(np.sum(one.mask & other.mask) > _SAME * np.sum(one.mask | other.mask))
 
 
 def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
