@@ -41,9 +41,6 @@ PALETTE = np.array(
 
 ALPHA = 0.7
 """Opacity of surfaces unless given."""
-_OUTLINE_COLOUR = np.array([0.05, 0.05, 0.05, 1.0])
-_LINE_WIDTH = 0.002
-"""Of outlines, metres."""
 
 
 def markers(
@@ -92,7 +89,8 @@ def markers(
             points=points,
         )
 
-    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=_LINE_WIDTH)
+    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=0.002)
+    black = np.array([0.05, 0.05, 0.05, 1.0])
     found = [make_marker(header=header, action=_DELETE_ALL)]
     for number, (surface_vertices, surface_faces, outline), colour in zip(ids, meshes, paint, strict=True):
         vertices, faces = checked_mesh(surface_vertices, surface_faces)
@@ -100,7 +98,7 @@ def markers(
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
         found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
         lines = [point(x=x, y=y, z=z) for x, y, z in _checked_outline(outline).tolist()]
-        found.append(marker("outline", number, _LINE_LIST, _OUTLINE_COLOUR, as_wide, lines))
+        found.append(marker("outline", number, _LINE_LIST, black, as_wide, lines))
     return types("visualization_msgs/msg/MarkerArray")(markers=found)
 
 

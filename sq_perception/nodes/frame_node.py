@@ -47,10 +47,6 @@ from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
 from sq_perception.tracking import association
 
-_WORKER_END = 3.0
-"""Seconds that a deactivation waits for the current frame."""
-_DEFECTS = 10
-"""Consecutive frames that fail by a program or device error, after which the node restarts."""
 TRIGGER_TIMEOUT = 5.0
 """Seconds without a frame after which ~/trigger and ~/recover fail, beyond those that an image waits for its
 camera_info: five periods of the slowest camera in use."""
@@ -159,7 +155,7 @@ class FrameNode(ManagedNode):
             source.close()
         self._resolve(Outcome(False, "the node has been deactivated"))
         if self._worker is not None:
-            self._worker.join(_WORKER_END)
+            self._worker.join(3.0)
             if self._worker.is_alive():
                 self.get_logger().warning("the current frame takes long; it is the last one and is not published")
 
@@ -300,9 +296,9 @@ class FrameNode(ManagedNode):
         """Log a program error, which costs this frame only."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
         self._defects += 1
-        if self._defects == _DEFECTS:
+        if self._defects == 10:
             self._engine.discard()
-            self._fail(f"{_DEFECTS} frames in a row failed, the last one by {text}")
+            self._fail(f"10 frames in a row failed, the last one by {text}")
 
     # Services and diagnostics, in the executor's thread
 

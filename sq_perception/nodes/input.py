@@ -38,8 +38,6 @@ from sq_perception.nodes.tracking import Pose
 from sq_perception.recordings.cloud_file import LABEL_FIELDS, UNORGANISED
 from sq_perception.recordings.publication import size_of
 
-_INFOS = 16
-_MASKS = 8
 _WAITING = 64
 """Images that wait for camera_info or mask at the same time; beyond them the oldest stops waiting. If it were dropped
 instead, a camera that sends so many within ``patience`` would never get an answer."""
@@ -93,7 +91,7 @@ class Input:
         """Guards the following attributes."""
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
-        self._infos: deque[_Info] = deque(maxlen=_INFOS)
+        self._infos: deque[_Info] = deque(maxlen=16)
         self._image_stamp = -1
         """Stamp of the last image."""
         self._are_paired = False
@@ -285,7 +283,7 @@ class Input:
             return
         with self._changed:
             self._masks[stamp_of(message)] = message
-            while len(self._masks) > _MASKS:
+            while len(self._masks) > 8:
                 self._masks.popitem(last=False)
             self._promote(monotonic())
 

@@ -48,9 +48,6 @@ from sq_perception.recovery.recovery import timed
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 ARRIVAL = Duration(seconds=0.5)
 """Seconds that the last markers may take to arrive before their publisher is destroyed."""
-_ALL_AGAIN = 5.0
-"""Seconds between two messages of the whole planning scene: a planner receives none while it plans, its queue holds
-ten, and a lost message would leave its world wrong for good."""
 
 class Outputs:
     """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
@@ -213,7 +210,8 @@ class OptionalOutputs:
         """Publish the changes of the planning scene, from time to time all of it."""
         if monotonic() >= self._all_due:
             self._scene.repeat()
-            self._all_due = monotonic() + _ALL_AGAIN
+            # A planner receives none while it plans, and a lost message would leave its world wrong for good.
+            self._all_due = monotonic() + 5.0
         if not (parameters.publish_collision_objects and found.header.frame_id):
             return
         objects = self._scene.changes(

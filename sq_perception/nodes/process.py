@@ -37,11 +37,6 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_F
 """Spinning threads take cores from other nodes: on two busy cores a frame took 30 ms with these settings and 50 to 150
 ms without. Small solves and images gain nothing from a second thread: OpenCV's took a tenth of the processor time of a
 VGA frame of one body, and saved 2 % on an idle core."""
-_M_ARENA_MAX, _HEAPS = -8, 2
-"""The option of glibc's malloc.h, and the number of heaps: with one, threads waited for each other and a frame took 10
-% more processor time; with two it took the same as with one per thread."""
-_LOOK = 0.1
-"""Seconds between two checks for a signal."""
 
 
 _Node = TypeVar("_Node", bound="Stoppable")
@@ -164,7 +159,7 @@ def share_heaps() -> None:
     Changes nothing without glibc.  For the start of a process: heaps that are there already stay.
     """
     with suppress(AttributeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)
+        ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of malloc.h; with one heap threads wait for each other
 
 
 @contextmanager
@@ -218,7 +213,7 @@ def _spin(nodes: Sequence[Any], executor: Executor, stop: _Stop) -> int:
     try:
         while rclpy.ok() and not stop.received:
             with suppress(InvalidHandle):  # ros2/rclpy issue 1284: an entity was destroyed by another thread
-                executor.spin_once(timeout_sec=_LOOK)
+                executor.spin_once(timeout_sec=0.1)
             failed = next((node for node in nodes if node.start_failure), None)
             if failed is not None:
                 _explain(failed.get_fully_qualified_name().lstrip("/"), failed.start_failure)

@@ -30,10 +30,6 @@ from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.depth_units import Stated
 from sq_perception.recordings import camera_document
 
-_SKEW = 1e-6
-"""Skew as a share of fx; no depth camera in use has any."""
-_MOST_NODES = 10_000
-"""Mappings and lists of a document that are looked at; a scene of BOP has 3 for each of a thousand images."""
 CAMERA_FILES = (
     "camera_info.yaml",
     "camera_info.yml",
@@ -225,7 +221,7 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
 
 def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None) -> Iterator[_Found]:
     """Return everything in a document that has a field of a camera."""
-    left = [_MOST_NODES] if left is None else left
+    left = [10_000] if left is None else left  # a scene of BOP has 3 for each of a thousand images
     left[0] -= 1
     if left[0] < 0:
         return
@@ -348,7 +344,7 @@ def _matrix(one: _Found) -> np.ndarray:
     if matrix[2, :2].any() and not matrix[:2, 2].any() and numbers.size != 12:  # column by column
         matrix = matrix.T
     matrix = matrix[:3, :3]
-    if abs(matrix[0, 1]) > _SKEW * abs(matrix[0, 0]):
+    if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
         raise FrameError(f"{name}: expected no skew, got {matrix[0, 1]:g}")
     if matrix.any() and not np.allclose(matrix[2], [0, 0, 1]):
         raise FrameError(f"{name}: expected 0 0 1 in its last row, got {matrix[2].tolist()}")

@@ -28,8 +28,6 @@ _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 _log = logging.getLogger(__name__)
 ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
-_LEVELS = 4
-"""Levels of folders below the one that was named: a benchmark's are set, scene and depth."""
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -89,10 +87,10 @@ class RecordedInput:
         self._are_deeper = False
         found = self._in_folders(path, None)
         if self._are_deeper:
-            _log.warning("%s: folders in it are looked into for %d levels, and not farther down", path, _LEVELS)
+            _log.warning("%s: folders in it are looked into for 4 levels, and not farther down", path)
         return found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
 
-    def _in_folders(self, folder: Path, above: str | Path | None, levels: int = _LEVELS) -> list[_Source]:
+    def _in_folders(self, folder: Path, above: str | Path | None, levels: int = 4) -> list[_Source]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
         try:
             camera_info = self._options.camera_info or camera_in(folder) or above

@@ -61,9 +61,6 @@ CHUNK_BYTES = 4 * 2**20
 """Bytes of messages in a chunk: enough to pack well, little to lose."""
 SUPERQUADRICS, MARKERS = "/recover_node/superquadrics", "/recover_node/markers"
 RENDERED, LABELS, DEPTH = "/recover_node/rendered_depth", "/mask/image", "/depth/image"
-LONGEST_NAME = 255
-"""Letters of a topic or frame id: a damaged recording's must not be copied into every marker."""
-
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SECOND = 10**9
 _STORE: Any = get_typestore(Stores.ROS2_JAZZY)
@@ -176,8 +173,8 @@ class ResultBag:
 
     def _header(self, frame: RecordedFrame, stamp: Stamp) -> Any:
         frame_id = frame.frame_id if frame.topic else (CUBE_FRAME if frame.is_cube else CAMERA_FRAME)
-        if len(frame_id) > LONGEST_NAME:
-            raise FrameError(f"{frame.name}: frame_id: expected at most {LONGEST_NAME} letters, got {len(frame_id)}")
+        if len(frame_id) > 255:  # a damaged recording's must not be copied into every marker
+            raise FrameError(f"{frame.name}: frame_id: expected at most 255 letters, got {len(frame_id)}")
         time = types("builtin_interfaces/msg/Time")(sec=stamp.sec, nanosec=stamp.nanosec)
         return types("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
 
@@ -193,7 +190,7 @@ class ResultBag:
 def _depth_topic(topic: str) -> str:
     """Return the input's topic, unless it is none, or one of the results."""
     topic = raw_topic(topic)
-    fits = _TOPIC.fullmatch(topic) is not None and len(topic) <= LONGEST_NAME
+    fits = _TOPIC.fullmatch(topic) is not None and len(topic) <= 255
     return topic if fits and topic not in (SUPERQUADRICS, MARKERS, RENDERED, LABELS) else DEPTH
 
 
