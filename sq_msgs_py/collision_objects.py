@@ -77,14 +77,8 @@ class Scene:
         self._gone = {key: left - 1 for key, left in self._gone.items() if left > 1}
 
     def changes(
-        self,
-        superquadrics: SuperquadricArray,
-        header: Any,
-        hidden: Iterable[int] = (),
-        *,
-        rests: bool = True,
-        meshes: Callable[[], Sequence[Mesh]] | None = None,
-        prefix: str = PREFIX,
+        self, superquadrics: SuperquadricArray, header: Any, hidden: Iterable[int] = (), *, rests: bool = True,
+        meshes: Callable[[], Sequence[Mesh]] | None = None, prefix: str = PREFIX,
     ) -> list[CollisionObject]:
         """Objects to ADD and to REMOVE after another frame, by :func:`collision_objects` and :func:`removals`.
 
@@ -155,11 +149,7 @@ def _half_sphere(count: int = 128) -> np.ndarray:
 
 
 def collision_objects(
-    superquadrics: SuperquadricArray,
-    header: Any,
-    *,
-    meshes: Sequence[Mesh] | None = None,
-    prefix: str = PREFIX,
+    superquadrics: SuperquadricArray, header: Any, *, meshes: Sequence[Mesh] | None = None, prefix: str = PREFIX
 ) -> list[CollisionObject]:
     """Return one object to ADD for each body that did not fail; one of the same id that is there already is replaced.
 

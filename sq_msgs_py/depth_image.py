@@ -227,11 +227,7 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
     if width // across < 1 or height // down < 1:
         raise ImageError(f"camera_info: expected an image of at least 1 x 1, got {message.width} x {message.height}")
     return Intrinsics(
-        width=width // across,
-        height=height // down,
-        fx=fx / across,
-        fy=fy / down,
-        cx=(cx - region.x_offset) / across,
+        width=width // across, height=height // down, fx=fx / across, fy=fy / down, cx=(cx - region.x_offset) / across,
         cy=(cy - region.y_offset) / down,
     )
 
@@ -264,12 +260,7 @@ def _to_message(pixels: np.ndarray, header: Any, encoding: str, types: MessageTy
     little = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
     height, width = pixels.shape
     message: Image = types("sensor_msgs/msg/Image")(
-        header=header,
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=width * pixels.dtype.itemsize,
+        header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=width * pixels.dtype.itemsize
     )
     message.data = byte_array(little)  # the constructor of rclpy's class would copy it twice
     return message

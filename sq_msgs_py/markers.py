@@ -44,14 +44,8 @@ ALPHA = 0.7
 
 
 def markers(
-    meshes: Sequence[Mesh],
-    ids: Sequence[int],
-    header: Any,
-    *,
-    colours: np.ndarray | None = None,
-    alpha: float = ALPHA,
-    namespace: str = "superquadrics",
-    types: MessageTypes = installed,
+    meshes: Sequence[Mesh], ids: Sequence[int], header: Any, *, colours: np.ndarray | None = None, alpha: float = ALPHA,
+    namespace: str = "superquadrics", types: MessageTypes = installed,
 ) -> MarkerArray:
     """Return markers of n bodies, which replace all earlier ones.
 
@@ -78,15 +72,8 @@ def markers(
     def marker(kind: str, number: int, shape: int, colour: np.ndarray, scale: Any, points: list[Any]) -> Any:
         red, green, blue, opacity = (float(channel) for channel in colour)
         return make_marker(
-            header=header,
-            ns=f"{namespace}/{kind}",
-            id=number,
-            type=shape,
-            action=_ADD,
-            pose=nowhere,
-            scale=scale,
-            color=types("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity),
-            points=points,
+            header=header, ns=f"{namespace}/{kind}", id=number, type=shape, action=_ADD, pose=nowhere, scale=scale,
+            color=types("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity), points=points,
         )
 
     as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=0.002)

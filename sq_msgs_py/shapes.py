@@ -100,10 +100,7 @@ def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def enclosing_factor(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    size: np.ndarray,
-    shape: np.ndarray,
+    vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, shape: np.ndarray,
     taper: np.ndarray | tuple[float, float] = (0.0, 0.0),
 ) -> float:
     """Return by how much a mesh of points on a body must grow about the centre to enclose it, at least 1.

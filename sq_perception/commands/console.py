@@ -69,9 +69,7 @@ class Parser(argparse.ArgumentParser):
 def parser(command: str, description: str, epilog: str | None = None) -> argparse.ArgumentParser:
     """Make the parser of one command, whose texts keep their lines."""
     return Parser(
-        prog=f"sq-perception {command}",
-        description=description,
-        epilog=epilog,
+        prog=f"sq-perception {command}", description=description, epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
@@ -149,8 +147,7 @@ def folder(text: str) -> Path:
 
 
 def replaced_input(
-    inputs: Sequence[Path],
-    files: Mapping[str, str | Path | None],
+    inputs: Sequence[Path], files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,
 ) -> str:
     """Complain if an output would replace an input; empty if none would.
@@ -174,8 +171,7 @@ def add_frames(command: argparse.ArgumentParser) -> None:
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
     add(
-        "--camera-info",
-        metavar="FILE",
+        "--camera-info", metavar="FILE",
         help="intrinsics of images and bags, before their own: a file of K, or fx,fy,cx,cy",
     )
     add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
@@ -190,21 +186,15 @@ def add_frames(command: argparse.ArgumentParser) -> None:
 def add_depth(command: argparse.ArgumentParser) -> None:
     """Add the options for the meaning of depth values."""
     command.add_argument(
-        "--depth-scale",
-        type=positive,
-        metavar="N",
+        "--depth-scale", type=positive, metavar="N",
         help="units per metre (default: from a camera file, else 1000 for integers, 1 for floats)",
     )
     command.add_argument(
-        "--depth-kind",
-        choices=("z", "range"),
-        default="z",
+        "--depth-kind", choices=("z", "range"), default="z",
         help="range: images hold the distance to the camera's centre (Isaac's distance_to_camera), not z",
     )
     command.add_argument(
-        "--frame",
-        type=_cloud_frame,
-        metavar="POSE",
+        "--frame", type=_cloud_frame, metavar="POSE",
         help="for clouds in another frame, where the camera is in it: X,Y,Z (it looks at the middle), "
         "X,Y,Z,QX,QY,QZ,QW, or link (x forward, z up) or graphics (y up, z backward)",
     )

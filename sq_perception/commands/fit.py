@@ -45,9 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     command = parser("fit", HELP, EPILOG)
     add = command.add_argument
     add("files", nargs="+", metavar="FILE", help="clouds or meshes of one object each")
-    add(
-        "--most", type=at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)"
-    )
+    add("--most", type=at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)")
     add("--sigma", type=positive, metavar="S", help="noise of the points in their unit (default: estimated)")
     add("--no-taper", action="store_true", help="fit no taper (one body only)")
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")

@@ -96,8 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="sq-perception",
         description="Superquadrics from depth images: size, shape, pose and uncertainty of the objects in them.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"sq-perception {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -118,17 +118,13 @@ def main(arguments: Sequence[str]) -> int:
     add("--depth-min", type=float, default=0.0, metavar="M", help="metres; ignore nearer readings")
     add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; ignore farther readings")
     add(
-        "--roi",
-        type=_region,
-        metavar="X,Y,W,H",
+        "--roi", type=_region, metavar="X,Y,W,H",
         help="use only this part of each image, in pixels, after rectification",
     )
     masks = "label images NAME.png, 0 is background, or binary ones, NAME_000000.png ... (BOP)"
     add("--masks", type=_existing, metavar="DIR", help=masks)
     add(
-        "--distortion",
-        choices=("auto", "apply", "ignore"),
-        default="auto",
+        "--distortion", choices=("auto", "apply", "ignore"), default="auto",
         help="rectify images, assume they are rectified, or decide by their names; see below",
     )
     add("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
@@ -141,17 +137,12 @@ def main(arguments: Sequence[str]) -> int:
     add("--export-folder", type=folder, metavar="DIR", default=Path(), help="folder of the scenes (default: here)")
     add("--export-meshes", action="store_true", help="as close meshes instead of enclosing solids")
     add(
-        "--inflate",
-        type=number("a number from 0", lambda value: value >= 0),
-        default=0.0,
-        metavar="K",
+        "--inflate", type=number("a number from 0", lambda value: value >= 0), default=0.0, metavar="K",
         help="enlarge them by K standard deviations",
     )
     add("--mcap", type=target, metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
     add(
-        "--mcap-images",
-        metavar="LIST",
-        default="depth",
+        "--mcap-images", metavar="LIST", default="depth",
         help="images of the bag, comma separated: depth (default), rendered, labels, or none",
     )
     add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
@@ -159,17 +150,11 @@ def main(arguments: Sequence[str]) -> int:
     add("--poses", type=Path, metavar="FILE", help="camera poses of frames that show one scene, see below")
     add("--parts", action="store_true", help="also recover the parts of objects that one body does not explain")
     add(
-        "--time-budget",
-        type=positive,
-        default=math.inf,
-        metavar="S",
+        "--time-budget", type=positive, default=math.inf, metavar="S",
         help="seconds per frame after which fits try no further start",
     )
     add(
-        "--jobs",
-        type=at_least(1),
-        default=1,
-        metavar="N",
+        "--jobs", type=at_least(1), default=1, metavar="N",
         help="number of frames processed in parallel (1: the objects of one frame in parallel)",
     )
     score = number("a score from 0 to 1", lambda value: 0 <= value <= 1)
@@ -179,10 +164,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--max-objects", type=at_least(1), default=20, metavar="N", help="most objects, the largest first (default 20)")
     add("--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)")
     add(
-        "--workspace",
-        type=float,
-        nargs=6,
-        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        "--workspace", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box in the optical frame, metres, for the centres of objects",
     )
     options = command.parse_args(with_negatives(arguments))

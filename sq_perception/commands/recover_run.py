@@ -135,11 +135,8 @@ class RecoverRun:
         self.is_whole = False
         self._options = options
         self._settings = RecoveryOptions(
-            method=options.method,
-            max_objects=options.max_objects,
-            time_budget=options.time_budget,
-            max_size=options.max_size,
-            workspace=None if options.workspace is None else tuple(options.workspace),
+            method=options.method, max_objects=options.max_objects, time_budget=options.time_budget,
+            max_size=options.max_size, workspace=None if options.workspace is None else tuple(options.workspace),
             parts=options.parts,
         )
         done = result_json.Recovered()

@@ -57,8 +57,7 @@ def train(arguments: Sequence[str]) -> int:
         with progress() as bar:
             task = bar.add_task("training", total=config.steps)
             training.train(
-                config,
-                output,
+                config, output,
                 advance=lambda step, loss: bar.update(task, completed=step, description=f"loss {loss:.4f}"),
             )
     except training.Stopped as stopped:
@@ -119,8 +118,7 @@ def segment_views(arguments: Sequence[str]) -> int:
 def train_things(arguments: Sequence[str]) -> int:
     """Run ``sq-perception train-things``; return the exit code."""
     text = _TRAIN.format(
-        what="predicts the unseen side of objects",
-        views="views that `thing-views` wrote",
+        what="predicts the unseen side of objects", views="views that `thing-views` wrote",
         weights="things.safetensors, which `recover --model` takes",
     )
     example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"

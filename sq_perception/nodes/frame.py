@@ -90,11 +90,8 @@ class Frame:
 
 
 def decode(
-    message: DepthMessage,
-    calibration_of: Callable[[], Calibration] | None,
-    scale: float | None = None,
-    kind: str = "z",
-    view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
+    message: DepthMessage, calibration_of: Callable[[], Calibration] | None, scale: float | None = None,
+    kind: str = "z", view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Frame:
     """Decode a depth image message; raises ValueError for anything that prevents its processing.
 

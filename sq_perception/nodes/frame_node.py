@@ -70,22 +70,13 @@ class FrameNode(ManagedNode):
     """
 
     def __init__(
-        self,
-        name: str,
-        kind: type[RecoverParameters] = RecoverParameters,
-        *,
-        namespace: str | None = None,
-        context: Any = None,
-        defaults: Mapping[str, Any] = MappingProxyType({}),
+        self, name: str, kind: type[RecoverParameters] = RecoverParameters, *, namespace: str | None = None,
+        context: Any = None, defaults: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         super().__init__(name, namespace=namespace, context=context)
         self._engine = Engine(self)
         self._settings: LiveParameters[RecoverParameters] = LiveParameters(
-            self,
-            kind,
-            locked=self._why_locked,
-            check=self._engine.check,
-            changed=self._engine.follow,
+            self, kind, locked=self._why_locked, check=self._engine.check, changed=self._engine.follow,
             defaults=defaults,
         )
         self._statistics = Statistics()

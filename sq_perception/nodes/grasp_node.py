@@ -60,10 +60,7 @@ class GraspParameters(Parameters):
 
     autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     max_age: float = setting(
-        10.0,
-        "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.",
-        unit="s",
-        within=(0.0, 3600.0),
+        10.0, "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.", unit="s", within=(0.0, 3600.0)
     )
     no_cloud_warning: float = setting(
         5.0, "Warn after this time without bodies; 0 never warns.", unit="s", within=(0.0, 3600.0)

@@ -74,10 +74,7 @@ class Input:
     """
 
     def __init__(
-        self,
-        node: Node,
-        settings: LiveParameters[RecoverParameters],
-        is_wanted: Callable[[], bool],
+        self, node: Node, settings: LiveParameters[RecoverParameters], is_wanted: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
         self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
@@ -105,8 +102,7 @@ class Input:
         self._latched: Subscription | None = None
         self._mask = Listener(node, Image, "mask/image", self._on_mask, statistics)
         self._detections: Listener | None = optional(
-            node,
-            lambda kind: Listener(node, kind, "mask/detections", self._on_mask, statistics),
+            node, lambda kind: Listener(node, kind, "mask/detections", self._on_mask, statistics),
             "yolo_msgs/msg/DetectionArray",
         )
         kind = {RAW: Image, POINTS: PointCloud2}.get(transport, CompressedImage)
@@ -179,20 +175,15 @@ class Input:
                 arrival = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
             return arrival
 
-    def frame(
-        self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None
-    ) -> Frame:
+    def frame(self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None) -> Frame:
         """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.
 
         Raises ValueError for anything that keeps it from being processed.
         """
         message, use, source = arrival.message, parameters.use_masks, self._info
         frame = decode(
-            message,
-            None if source is None else lambda: self._calibration_of(message, source),
-            parameters.depth_scale or None,
-            parameters.depth_kind,
-            view,
+            message, None if source is None else lambda: self._calibration_of(message, source),
+            parameters.depth_scale or None, parameters.depth_kind, view,
         )
         if use == "never" and frame.labels is not None:
             frame = replace(frame, labels=None)
@@ -248,9 +239,7 @@ class Input:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
         has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
-        needs_mask = not has_labels and (
-            use == "always" or (use == "auto" and self._has_mask_publisher)
-        )
+        needs_mask = not has_labels and (use == "always" or (use == "auto" and self._has_mask_publisher))
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")

@@ -34,12 +34,7 @@ class RecoverInterfaces:
     def __init__(self, node: Node, outcomes: Outcomes, group: CallbackGroup) -> None:
         self._outcomes = outcomes
         optional(
-            node,
-            node.create_service,
-            "sq_msgs/srv/Recover",
-            "~/recover_array",
-            self._on_recover,
-            callback_group=group,
+            node, node.create_service, "sq_msgs/srv/Recover", "~/recover_array", self._on_recover, callback_group=group
         )
 
         def served(kind: Any) -> ActionServer:

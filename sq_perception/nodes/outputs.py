@@ -49,6 +49,7 @@ _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH
 ARRIVAL = Duration(seconds=0.5)
 """Seconds that the last markers may take to arrive before their publisher is destroyed."""
 
+
 class Outputs:
     """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
 
@@ -132,9 +133,7 @@ class Outputs:
                 )
 
 
-def pose_in(
-    poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame"
-) -> Pose:
+def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame") -> Pose:
     """Return the pose of a header's frame in the tf2 frame of a parameter, at its stamp; ValueError if unknown."""
     try:
         return poses.at(header, frame_id, patience)
@@ -215,10 +214,7 @@ class OptionalOutputs:
         if not (parameters.publish_collision_objects and found.header.frame_id):
             return
         objects = self._scene.changes(
-            found.array,
-            found.header,
-            hidden,
-            rests=bool(parameters.target_frame) or not parameters.fixed_frame,
+            found.array, found.header, hidden, rests=bool(parameters.target_frame) or not parameters.fixed_frame,
             meshes=(lambda: found.meshes) if parameters.collision_shapes == "mesh" else None,
             prefix=parameters.tf_prefix,
         )

@@ -115,12 +115,7 @@ class Tracking:
         return self._session.tally
 
     def identify(
-        self,
-        recovery: FrameRecovery,
-        origin: Hashable,
-        frame: Frame,
-        arrival: float,
-        parameters: RecoverParameters,
+        self, recovery: FrameRecovery, origin: Hashable, frame: Frame, arrival: float, parameters: RecoverParameters
     ) -> Identified:
         """Return bodies with the ids of their tracks; without ``tracking`` ids are labels, and tracks are dropped.
 

@@ -106,9 +106,7 @@ class RecordedBag:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        options: InputOptions | None = None,
+        self, path: str | Path, options: InputOptions | None = None,
         is_done: Callable[[Stamp], bool] = lambda stamp: False,
     ) -> None:
         self._path = Path(path)
@@ -305,16 +303,9 @@ class RecordedBag:
             warnings.append(f"several topics with masks, none is taken: {', '.join(self._mask_topics)}")
         return reading.of(
             RecordedFrame(
-                depth,
-                camera,
-                labels,
-                name,
-                stamp=message.stamp,
-                topic=self.topic,
+                depth, camera, labels, name, stamp=message.stamp, topic=self.topic,
                 frame_id=message.content.header.frame_id,
-                warning="; ".join(f"{self._path}: {text}" for text in warnings),
-                notes="; ".join(notes),
-                encoding=encoding,
-                received=message.received,
+                warning="; ".join(f"{self._path}: {text}" for text in warnings), notes="; ".join(notes),
+                encoding=encoding, received=message.received,
             )
         )

@@ -290,14 +290,8 @@ def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
     if not isinstance(region, dict):
         raise FrameError(f"roi: expected a mapping, got {reprlib.repr(region)}")
     return CameraInfo(
-        width,
-        height,
-        lens,
-        tuple(coefficients.tolist()),
-        tuple(matrix.tolist()),
-        tuple(projection.tolist()),
-        _count(one.get("binning x"), "binning_x"),
-        _count(one.get("binning y"), "binning_y"),
+        width, height, lens, tuple(coefficients.tolist()), tuple(matrix.tolist()), tuple(projection.tolist()),
+        _count(one.get("binning x"), "binning_x"), _count(one.get("binning y"), "binning_y"),
         Region(*(_count(region.get(part), part) for part in ("x_offset", "y_offset", "width", "height"))),
         depth_units.parse_scale(float(unit), name) if is_unit else None,
     )

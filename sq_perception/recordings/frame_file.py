@@ -198,11 +198,8 @@ class Reading:
 
 
 def read(
-    path: str | Path,
-    camera_info: str | Path | None = None,
-    projection: Projection = "pinhole",
-    distortion: Treatment = "auto",
-    reading: Reading | None = None,
+    path: str | Path, camera_info: str | Path | None = None, projection: Projection = "pinhole",
+    distortion: Treatment = "auto", reading: Reading | None = None,
 ) -> RecordedFrame:
     """Read one frame.
 
@@ -329,13 +326,7 @@ def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
         notes.append(cloud_file.LABELLED)
     warning = "" if found.is_image else cloud_file.UNORGANISED
     return RecordedFrame(
-        found.depth,
-        found.camera,
-        given,
-        path.name,
-        warning=warning,
-        notes="; ".join(notes),
-        encoding="32FC1",
+        found.depth, found.camera, given, path.name, warning=warning, notes="; ".join(notes), encoding="32FC1",
         has_free_space=found.is_image,
     )
 

@@ -40,9 +40,7 @@ class RecordedInput:
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        options: InputOptions | None = None,
+        self, names: Sequence[str], options: InputOptions | None = None,
         is_done: Callable[[str, str, Stamp | None], bool] = lambda file, topic, stamp: False,
     ) -> None:
         self._options, self._is_done = options or InputOptions(), is_done

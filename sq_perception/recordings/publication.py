@@ -216,14 +216,10 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
     return SuperquadricArray(
-        **{name: getattr(bodies.untapered(), name) for name in _OF_A_BODY},
-        taper=bodies.taper,
-        id=np.array(found.ids),
+        **{name: getattr(bodies.untapered(), name) for name in _OF_A_BODY}, taper=bodies.taper, id=np.array(found.ids),
         **{name: np.array([getattr(body, name) for body in recovery.bodies]) for name in _OF_EACH_BODY},
-        **{name: np.array(values, np.uint32) for name, values in found.columns.items()},
-        sigma_shape=deviations[:, 3:5],
-        sigma_centre=np.sqrt(np.einsum("nii->ni", centres)),
-        sigma_turn=deviations[:, 8:],
+        **{name: np.array(values, np.uint32) for name, values in found.columns.items()}, sigma_shape=deviations[:, 3:5],
+        sigma_centre=np.sqrt(np.einsum("nii->ni", centres)), sigma_turn=deviations[:, 8:],
     )
 
 
@@ -269,15 +265,9 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     """Return a batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
     count = len(bodies)
     return SuperquadricArray(
-        **{name: getattr(bodies, name) for name in _OF_A_BODY},
-        score=np.ones(count),
-        residual=np.zeros(count),
-        objectness=np.ones(count),
-        sigma_size=np.zeros((count, 3)),
-        sigma_shape=np.zeros((count, 2)),
-        sigma_centre=np.zeros((count, 3)),
-        sigma_turn=np.zeros((count, 3)),
-        id=np.arange(1, count + 1, dtype=np.uint32),
+        **{name: getattr(bodies, name) for name in _OF_A_BODY}, score=np.ones(count), residual=np.zeros(count),
+        objectness=np.ones(count), sigma_size=np.zeros((count, 3)), sigma_shape=np.zeros((count, 2)),
+        sigma_centre=np.zeros((count, 3)), sigma_turn=np.zeros((count, 3)), id=np.arange(1, count + 1, dtype=np.uint32),
         status=np.full(count, CONVERGED, dtype=np.uint32),
     )
 

@@ -101,12 +101,7 @@ def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = Non
 
 
 def write(
-    bodies: Superquadric,
-    path: str | Path,
-    form: str,
-    *,
-    names: Sequence[str] | None = None,
-    frame: str = "world",
+    bodies: Superquadric, path: str | Path, form: str, *, names: Sequence[str] | None = None, frame: str = "world",
     meshes: bool = False,
 ) -> list[Path]:
     """Write n bodies (n,) as a scene; the files, those of meshes behind the scene's.  ValueError as :func:`solids`.
