@@ -16,14 +16,14 @@ from collections.abc import Sequence
 from pkgutil import resolve_name
 
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, Parser, complain, show_log
-from sq_perception.files.version import __version__
+from sq_perception.files import __version__
 from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {
     "sample": ("rendering:sample", "write a simulated depth image to begin with"),
-    "recover": ("recover:main", "depth images in, superquadrics out"),
+    "recover": ("recover:recover", "depth images in, superquadrics out"),
     "fit": ("fit:main", "clouds or meshes of single objects in, superquadrics out"),
-    "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
+    "grasp": ("recover:grasp", "depth images in, grasps of a parallel gripper out"),
     "render": ("rendering:render", "draw a superquadric as a depth image"),
     "demo": ("demo:main", "a simulated camera and real ROS 2 nodes (extra 'ros')"),
     "train": ("training:train", "train a network"),

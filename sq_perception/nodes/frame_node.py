@@ -23,7 +23,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
@@ -35,8 +36,7 @@ from sq_perception.nodes import process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
-from sq_perception.nodes.interfaces import RecoverInterfaces
-from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.managed_node import ManagedNode, optional
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
@@ -69,6 +69,8 @@ class FrameNode(ManagedNode):
     configuration, as it is read there.
     """
 
+    _action: ActionServer | None = None
+
     def __init__(
         self, name: str, kind: type[RecoverParameters] = RecoverParameters, *, namespace: str | None = None,
         context: Any = None, defaults: Mapping[str, Any] = MappingProxyType({}),
@@ -97,7 +99,11 @@ class FrameNode(ManagedNode):
         apart = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
-        self._interfaces = RecoverInterfaces(self, self._next_outcome, apart)
+        optional(
+            self, self.create_service, "sq_msgs/srv/Recover", "~/recover_array", self._on_recover_array,
+            callback_group=apart,
+        )
+        self._action = optional(self, self._serve_images, "sq_msgs/action/Recover", apart)
         self.create_timer(1.0, self._on_second, clock=_STEADY)
         self.start(self._settings.current.autostart)
 
@@ -155,8 +161,10 @@ class FrameNode(ManagedNode):
         return super().close() and (self._worker is None or not self._worker.is_alive())
 
     def destroy_node(self) -> None:
-        """As rclpy's, with the action."""
-        self._interfaces.close()
+        """Destroy the node as rclpy does, and its action."""
+        action, self._action = self._action, None
+        if action is not None:
+            action.destroy()
         super().destroy_node()
 
     def _why_locked(self) -> str:
@@ -313,6 +321,31 @@ class FrameNode(ManagedNode):
         if found is not None:
             response.message = answers.text_of(found.array, found.header, response.message)
         return response
+
+    async def _on_recover_array(self, request: Any, response: Any) -> Any:
+        response.success, response.message, found = await self._next_outcome()
+        if found is not None:
+            response.bodies = answers.superquadric_array(found.array, found.covariances, found.header, found.parts)
+        return response
+
+    def _serve_images(self, kind: Any, group: CallbackGroup) -> ActionServer:
+        async def recover_images(goal: Any) -> Any:
+            """Recover as many images as the goal asks for; the first failure ends it."""
+            result = kind.Result()
+            for _ in range(max(int(goal.request.images), 1)):
+                if goal.is_cancel_requested:
+                    goal.canceled()
+                    return result
+                result = await self._on_recover_array(None, kind.Result())
+                if not result.success:
+                    goal.abort()
+                    return result
+                goal.publish_feedback(kind.Feedback(bodies=result.bodies))
+            goal.succeed()
+            return result
+
+        accept = {"cancel_callback": lambda _: CancelResponse.ACCEPT}
+        return ActionServer(self, kind, "~/recover_images", recover_images, callback_group=group, **accept)
 
     async def _next_outcome(self) -> Outcome:
         """Return the outcome of the next frame, or why there is none."""

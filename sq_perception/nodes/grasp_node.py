@@ -40,9 +40,8 @@ from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import FRICTION, PLACEMENT, grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched_qos, stamp_of
-from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
-from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.managed_node import ManagedNode, optional
 from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, check_prefix, setting
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics

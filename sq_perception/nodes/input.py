@@ -30,8 +30,8 @@ from sq_perception.nodes.frame import (
     listen_to_latched_info,
     stamp_of,
 )
-from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
+from sq_perception.nodes.managed_node import optional
 from sq_perception.nodes.parameters import POINTS, RAW, LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
 from sq_perception.nodes.tracking import Pose

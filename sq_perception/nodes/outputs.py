@@ -37,7 +37,7 @@ from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import detections, plane_message, transforms
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.nodes.frame import Frame, latched_qos
-from sq_perception.nodes.interfaces import optional
+from sq_perception.nodes.managed_node import optional
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError

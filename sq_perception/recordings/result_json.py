@@ -20,8 +20,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sq_perception.files import output_file
-from sq_perception.files.version import __version__
+from sq_perception.files import __version__, output_file
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
