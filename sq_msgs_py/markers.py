@@ -84,7 +84,10 @@ def markers(
         corners = [point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
         found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
-        lines = [point(x=x, y=y, z=z) for x, y, z in _checked_outline(outline).tolist()]
+        segments = np.asarray(outline, dtype=float)
+        if segments.size and (segments.ndim != 3 or segments.shape[1:] != (2, 3)):
+            raise ValueError(f"outline: expected segments (j, 2, 3), got {segments.shape}")
+        lines = [point(x=x, y=y, z=z) for x, y, z in segments.reshape(-1, 3).tolist()]
         found.append(marker("outline", number, _LINE_LIST, black, as_wide, lines))
     return types("visualization_msgs/msg/MarkerArray")(markers=found)
 
@@ -97,10 +100,3 @@ def checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError(f"faces: expected indices 0 to {len(vertices) - 1}, got {faces.min()} to {faces.max()}")
     return vertices, faces
-
-
-def _checked_outline(outline: np.ndarray) -> np.ndarray:
-    outline = np.asarray(outline, dtype=float)
-    if outline.size and (outline.ndim != 3 or outline.shape[1:] != (2, 3)):
-        raise ValueError(f"outline: expected segments (j, 2, 3), got {outline.shape}")
-    return outline.reshape(-1, 3)

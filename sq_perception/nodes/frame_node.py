@@ -39,7 +39,7 @@ from sq_perception.nodes.input import Arrival, Input
 from sq_perception.nodes.managed_node import ManagedNode, optional
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
-from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
+from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.nodes.tracking import Pose as CameraPose
 from sq_perception.recordings.publication import Findings
@@ -381,12 +381,9 @@ class FrameNode(ManagedNode):
             tally = self._tracking.tally
             more |= {"tracks": str(tally.tracks), "track ids given": str(tally.births)}
             more |= {"track resets": str(tally.resets), "frames without camera pose": str(tally.without_pose)}
-        self._diagnostics.publish(self._statistics.report(self, self._standing(silent), more))
-
-    def _standing(self, silent: bool) -> Standing | None:
-        """Return the level and message of diagnostics that do not depend on frames, if any."""
-        if (standing := self.standing(self._engine.fault)) is not None:
-            return standing
-        if not self._enabled:
-            return DiagnosticStatus.OK, "disabled"
-        return (DiagnosticStatus.WARN, "no depth images arrive") if silent else None
+        standing = self.standing(self._engine.fault)
+        if standing is None and not self._enabled:
+            standing = DiagnosticStatus.OK, "disabled"
+        elif standing is None and silent:
+            standing = DiagnosticStatus.WARN, "no depth images arrive"
+        self._diagnostics.publish(self._statistics.report(self, standing, more))

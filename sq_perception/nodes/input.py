@@ -124,11 +124,6 @@ class Input:
         return tuple(one for one in (self._image, self._mask, self._detections, self._info) if one is not None)
 
     @property
-    def _has_mask_publisher(self) -> bool:
-        topics = [one.topic for one in (self._mask, self._detections) if one is not None]
-        return any(self._node.count_publishers(topic) > 0 for topic in topics)
-
-    @property
     def silence(self) -> float:
         """Return the seconds since the last depth image."""
         return monotonic() - self._last_image
@@ -210,7 +205,7 @@ class Input:
     def _calibration_of(self, image: DepthMessage, source: Listener) -> Calibration:
         size = size_of(image)
         with self._changed:
-            info = self._info_for(size, stamp_of(image))
+            info, _ = self._info_for(size, stamp_of(image))
             last = self._infos[-1] if self._infos else None
         if info is not None and info.calibration is not None:
             return info.calibration
@@ -238,8 +233,10 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
+        topics = [one.topic for one in (self._mask, self._detections) if one is not None]
+        has_publisher = any(self._node.count_publishers(topic) > 0 for topic in topics)
         has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
-        needs_mask = not has_labels and (use == "always" or (use == "auto" and self._has_mask_publisher))
+        needs_mask = not has_labels and (use == "always" or (use == "auto" and has_publisher))
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")
@@ -295,21 +292,18 @@ class Input:
         if arrival.size is None:
             return True
         stamp = stamp_of(arrival.message)
-        has_info = self._info is None or self._knows_camera(arrival.size, stamp)
+        has_info = self._info is None or self._info_for(arrival.size, stamp)[1]
         return has_info and (not arrival.needs_mask or stamp in self._masks)
 
-    def _knows_camera(self, size: tuple[int, int], stamp: int) -> bool:
-        """Return whether the camera_info of an image has arrived, or an earlier one will do.
+    def _info_for(self, size: tuple[int, int], stamp: int) -> tuple[_Info | None, bool]:
+        """Return the camera_info of an image, or the latest of its size, and whether the image need not wait.
 
         Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
         another one's would shift every body.
         """
         fitting = [info for info in self._infos if info.size == size]
-        if not fitting or any(info.stamp == stamp for info in fitting):
-            return bool(fitting)
-        return not self._are_paired or all(info.calibration == fitting[0].calibration for info in fitting)
-
-    def _info_for(self, size: tuple[int, int], stamp: int) -> _Info | None:
-        fitting = [info for info in self._infos if info.size == size]
-        best = [info for info in fitting if info.stamp == stamp] or fitting
-        return best[-1] if best else None
+        if own := [info for info in fitting if info.stamp == stamp]:
+            return own[-1], True
+        if not fitting:
+            return None, False
+        return fitting[-1], not self._are_paired or all(one.calibration == fitting[0].calibration for one in fitting)

@@ -362,7 +362,10 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     if projection == "orthographic" or is_cube:
         has_camera = "K" in fields and not is_cube
         warning = "orthographic was asked for, and a file has the matrix K of a pinhole camera" if has_camera else ""
-        return RecordedFrame(_single(depth), unit_cube.camera(width, height), labels, path.name, warning=warning)
+        with np.errstate(over="ignore"):  # some programs write the largest number that their type holds
+            single = depth.astype(np.float32)
+        single = np.where(np.isfinite(single), single, np.float32(np.nan))
+        return RecordedFrame(single, unit_cube.camera(width, height), labels, path.name, warning=warning)
     if "K" not in fields:
         raise ValueError("expected a field 'K', the 3 x 3 camera matrix")
     try:
@@ -375,10 +378,3 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     return RecordedFrame(
         reading.z(found.depth, camera), camera, labels, path.name, notes="; ".join(found.notes), encoding="32FC1"
     )
-
-
-def _single(depth: np.ndarray) -> np.ndarray:
-    """Depth as float32, NaN where it is no reading: some programs write the largest number that their type holds."""
-    with np.errstate(over="ignore"):
-        found = depth.astype(np.float32)
-    return np.where(np.isfinite(found), found, np.float32(np.nan))

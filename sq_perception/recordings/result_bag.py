@@ -61,7 +61,6 @@ CHUNK_BYTES = 4 * 2**20
 """Bytes of messages in a chunk: enough to pack well, little to lose."""
 SUPERQUADRICS, MARKERS = "/recover_node/superquadrics", "/recover_node/markers"
 RENDERED, LABELS, DEPTH = "/recover_node/rendered_depth", "/mask/image", "/depth/image"
-_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SECOND = 10**9
 _STORE: Any = get_typestore(Stores.ROS2_JAZZY)
 
@@ -154,7 +153,10 @@ class ResultBag:
         header, messages = shown.header, []
         encoding = frame.encoding or ("mono16" if frame.is_cube else "32FC1")
         if "depth" in self._images:
-            topic = _depth_topic(frame.topic)
+            topic = raw_topic(frame.topic)
+            results = (SUPERQUADRICS, MARKERS, RENDERED, LABELS)
+            if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic) or len(topic) > 255 or topic in results:
+                topic = DEPTH
             if not frame.is_cube:
                 info = depth_image.intrinsics_to_message(intrinsics(frame.camera), header, types)
                 messages.append((camera_info_topic(topic), info))
@@ -185,13 +187,6 @@ class ResultBag:
             return frame.stamp
         last = self._last.sec * _SECOND + self._last.nanosec
         return Stamp(*divmod(min(last + round(INTERVAL * _SECOND), latest * _SECOND), _SECOND))
-
-
-def _depth_topic(topic: str) -> str:
-    """Return the input's topic, unless it is none, or one of the results."""
-    topic = raw_topic(topic)
-    fits = _TOPIC.fullmatch(topic) is not None and len(topic) <= 255
-    return topic if fits and topic not in (SUPERQUADRICS, MARKERS, RENDERED, LABELS) else DEPTH
 
 
 @cache
