@@ -165,26 +165,8 @@ def replaced_input(
     return ""
 
 
-def add_frames(command: argparse.ArgumentParser) -> None:
-    """Add the arguments for recorded frames and their recovery."""
-    add = command.add_argument
-    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
-    add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
-    add(
-        "--camera-info", metavar="FILE",
-        help="intrinsics of images and bags, before their own: a file of K, or fx,fy,cx,cy",
-    )
-    add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
-    add("--camera-info-topic", metavar="NAME", help="camera_info topic, if it is not beside the depth topic")
-    add_depth(command)
-    add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
-    methods = ("auto", "network", "symmetry", "classic")
-    add("--method", choices=methods, default="auto", help="recovery method, see recover --help")
-    add_ignore_masks(command)
-
-
 def add_depth(command: argparse.ArgumentParser) -> None:
-    """Add the options for the meaning of depth values."""
+    """Add the options for the meaning of depth values and masks."""
     command.add_argument(
         "--depth-scale", type=positive, metavar="N",
         help="units per metre (default: from a camera file, else 1000 for integers, 1 for floats)",
@@ -198,6 +180,7 @@ def add_depth(command: argparse.ArgumentParser) -> None:
         help="for clouds in another frame, where the camera is in it: X,Y,Z (it looks at the middle), "
         "X,Y,Z,QX,QY,QZ,QW, or link (x forward, z up) or graphics (y up, z backward)",
     )
+    command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
 def _cloud_frame(text: str) -> CloudFrame:
@@ -207,11 +190,6 @@ def _cloud_frame(text: str) -> CloudFrame:
         return CloudFrame.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def add_ignore_masks(command: argparse.ArgumentParser) -> None:
-    """Add the option that ignores the labels of frames."""
-    command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
 def progress() -> Progress:

@@ -13,8 +13,6 @@ from pathlib import Path
 
 from sq_perception.commands.console import (
     add_depth,
-    add_frames,
-    add_ignore_masks,
     at_least,
     folder,
     number,
@@ -79,40 +77,36 @@ camera files:
   a text or NPZ of K or fx fy cx cy.  If the file has no size, the image's is used.  A depth_scale in it is applied.
 
 distortion:
-  If a camera_info has nonzero distortion coefficients, --distortion auto treats images as rectified if the last two
-  parts of their topic or path contain the word rect or rectified (image_rect, image_rect_raw, rect/image.png), and
-  otherwise rectifies them: their camera is then that of K, in a window that shows what the raw image shows.
-  models: plumb_bob, rational_polynomial, equidistant.
+  If a camera_info has nonzero distortion coefficients (plumb_bob, rational_polynomial, equidistant), --distortion auto
+  treats images as rectified if the last two parts of their topic or path contain the word rect or rectified
+  (image_rect, image_rect_raw, rect/image.png), and otherwise rectifies them.
 
-tracking:
-  --track follows bodies over the frames of each bag and folder, for a static camera (docs/tracking.md); "track" has the
-  numbers fused so far.  With --jobs each frame is recovered independently.
-
-several cameras:
+several frames:
+  --track follows bodies over the frames of each bag and folder, for a static camera (docs/tracking.md).
   --poses FILE fuses all frames as views of one static scene and prints the result at the end, in the world of the poses
   ("scene" in --json).  FILE has one line per frame as in TUM RGB-D: NAME tx ty tz qx qy qz qw, camera to world in
   metres; NAME is the frame's file, its topic or its stamp in seconds.
 
-bags:
+bags, meshes, obstacles:
   --mcap writes what recover_node would have published and read (docs/bags.md).
-
-meshes:
-  One file per frame with all its bodies, in metres, coloured as in the pictures; none for a frame without bodies.  PLY
-  has the coordinates of the JSON.  GLB, whose y axis points up, turns them by 180 degrees about x and names each body
-  by its index in "superquadrics": body_0, body_1, ...
-
-obstacles:
-  --export writes one file per frame for planners and simulators, in metres, in the frame of the JSON.  Each body is
-  the smallest enclosing box, cylinder, sphere or capsule (not in URDF); --inflate enlarges it by its uncertainty.
-  Meshes of URDF and SDF are STL files beside it.
+  --meshes and --export write a file per frame with bodies, in metres; PLY and obstacles have the coordinates of the
+  JSON, GLB (y up) turns them by 180 degrees about x.  Each obstacle is the smallest enclosing box, cylinder, sphere or
+  capsule (not in URDF); --inflate enlarges it by its uncertainty.  Meshes of URDF and SDF are STL files beside it.
 """
 
 
 def recover(arguments: Sequence[str]) -> int:
     """Run ``sq-perception recover``; return the exit code."""
     command = parser("recover", HELP, EPILOG)
-    add_frames(command)
     add = command.add_argument
+    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
+    add("--camera-info", metavar="FILE", help="intrinsics of images and bags, before their own: a file, or fx,fy,cx,cy")
+    add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
+    add("--camera-info-topic", metavar="NAME", help="camera_info topic, if it is not beside the depth topic")
+    add_depth(command)
+    add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
+    add("--method", choices=("auto", "network", "symmetry", "classic"), default="auto", help="see below")
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     add("--jsonl", type=text_target, metavar="OUT", help="append a line per frame, skip those already there, see below")
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
@@ -208,7 +202,6 @@ def grasp(arguments: Sequence[str]) -> int:
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
     add("--topic", metavar="TOPIC", help="depth topic of a bag, if it has several")
     add_depth(command)
-    add_ignore_masks(command)
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")

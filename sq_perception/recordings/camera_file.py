@@ -198,7 +198,11 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
     found = list(_cameras(document))
     whole = [one for one in found if _has_camera(one)]
     if not whole:
-        raise FrameError(_what_is_missing(found))
+        names = (_FX, _FY, _CX, _CY)
+        if has := max(([name for name in names if name in one.fields] for one in found), key=len, default=None):
+            missing = ", ".join(name for name in names if name not in has)
+            raise FrameError(f"expected {missing} (or other names for them) beside {', '.join(has)}")
+        raise FrameError("expected fx, fy, cx, cy, or a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12")
     if isinstance(document, dict) and all(str(key).isdigit() for key in document):
         if name is None:
             whole = whole[:1]
@@ -260,15 +264,6 @@ def _has_camera(one: _Found) -> bool:
 
 def _is_matrix(value: Any) -> bool:
     return isinstance(value, list | dict) and bool(value)
-
-
-def _what_is_missing(found: list[_Found]) -> str:
-    best = max(found, key=lambda one: len(one.fields.keys() & {_FX, _FY, _CX, _CY}), default=None)
-    has = [] if best is None else [name for name in (_FX, _FY, _CX, _CY) if name in best.fields]
-    if has:
-        missing = [name for name in (_FX, _FY, _CX, _CY) if name not in has]
-        return f"expected {', '.join(missing)} (or other names for them) beside {', '.join(has)}"
-    return "expected fx, fy, cx, cy, or a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12"
 
 
 def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:

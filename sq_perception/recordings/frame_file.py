@@ -114,22 +114,12 @@ class Reading:
     Raises ValueError for a scale or depth that is not positive, limits that leave nothing, an empty region, or another
     kind.
 
-    Attributes
-    ----------
-    scale : float or None
-        Units a metre; None: as a file states them, else 1000 for whole numbers and 1 for floats.
-    nearest, farthest : float
-        Readings beyond, metres, are none.
-    region : (4,) of int or None
-        Left column, top row, width and height of the part to look at, pixels of the rectified image.
-    masks : Path or None
-        A folder with the masks of each frame, by its name (:func:`sq_perception.files.unpacking.label_image`).
-    ignore_masks : bool
-        Whether no labels are read, wherever they are.
-    kind : str
-        "z", or "range" for images of distances to the camera's centre.
-    frame : CloudFrame or None
-        Where the camera is in the frame of clouds; None: in their origin, and looks along z.
+    ``scale`` float or None: units a metre; None: as a file states them, else 1000 for whole numbers and 1 for floats.
+    ``nearest``, ``farthest``: readings beyond, metres, are none.  ``region`` (4,) of int or None: left column, top row,
+    width and height of the part to look at, pixels of the rectified image.  ``masks`` Path or None: a folder with the
+    masks of each frame, by its name (:func:`sq_perception.files.unpacking.label_image`).  ``ignore_masks``: whether no
+    labels are read, wherever they are.  ``kind``: "z", or "range" for images of distances to the camera's centre.
+    ``frame`` CloudFrame or None: where the camera is in the frame of clouds; None: in their origin, and looks along z.
     """
 
     scale: float | None = None
