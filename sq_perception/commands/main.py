@@ -31,7 +31,7 @@ COMMANDS = {
     "train-things": ("training:train_things", "train the network that predicts the unseen side of things"),
     "segment-views": ("training:segment_views", "draw segments of simulated scenes to train on"),
     "train-masks": ("training:train_masks", "train the network that finds outliers in segments"),
-    "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
+    "evaluate": ("training:evaluate", "the thesis' tables and plots, for networks and fits"),
     "doctor": ("installation:doctor", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("installation:warm_up", "compile all kernels in advance"),
 }

@@ -28,8 +28,7 @@ from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
-from sq_perception.recordings.inputs import RecordedInput
-from sq_perception.recordings.tracks import CameraPoses, RecordedTracks, sequence_of
+from sq_perception.recordings.inputs import CameraPoses, RecordedInput, RecordedTracks, sequence_of
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions

@@ -202,7 +202,7 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
         if has := max(([name for name in names if name in one.fields] for one in found), key=len, default=None):
             missing = ", ".join(name for name in names if name not in has)
             raise FrameError(f"expected {missing} (or other names for them) beside {', '.join(has)}")
-        raise FrameError("expected fx, fy, cx, cy, or a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12")
+        raise FrameError("expected fx, fy, cx, cy, a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12")
     if isinstance(document, dict) and all(str(key).isdigit() for key in document):
         if name is None:
             whole = whole[:1]

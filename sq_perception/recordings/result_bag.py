@@ -42,8 +42,8 @@ from sq_perception.imaging.calibration import intrinsics
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_reader import camera_info_topic, raw_topic
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.inputs import INTERVAL
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, Findings, Identified
-from sq_perception.recordings.tracks import INTERVAL
 from sq_perception.recovery.recoverer import FrameRecovery, render_recovery
 from sq_perception.tracking.session import Followed
 
