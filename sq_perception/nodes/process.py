@@ -21,9 +21,9 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -79,23 +79,25 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             for variable, value in {**_THREADS, **additions()}.items():
                 os.environ.setdefault(variable, value)
             share_heaps()
-            with garbage_postponed():
-                import rclpy
-                from rclpy.executors import SingleThreadedExecutor
-                from rclpy.signals import SignalHandlerOptions
+            gc.disable()
+            import rclpy
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
 
-                from sq_perception.geometry.threads import TURN
+            from sq_perception.geometry.threads import TURN
 
-                sys.setswitchinterval(TURN)  # services waited behind the threads that fit
+            sys.setswitchinterval(TURN)  # services waited behind the threads that fit
 
-                # rclpy's own handlers end the context from another thread, and give way to the default action for an
-                # instant when they go: a second Ctrl-C then killed the process.
-                quietly = SignalHandlerOptions.NO
-                rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
-                # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
-                # deleted.
-                executor = SingleThreadedExecutor()
-                nodes.extend(create())
+            # rclpy's own handlers end the context from another thread, and give way to the default action for an
+            # instant when they go: a second Ctrl-C then killed the process.
+            quietly = SignalHandlerOptions.NO
+            rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
+            # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
+            # deleted.
+            executor = SingleThreadedExecutor()
+            nodes.extend(create())
+            gc.freeze()
+            gc.enable()
             stop.starting = False
             code = _spin(nodes, executor, stop)
         except Exception as error:
@@ -111,6 +113,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
         # Around the handling of failures too.
         code = 0
     finally:
+        gc.enable()
         # A second Ctrl-C (launch sends one) must not interrupt the end.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
@@ -160,22 +163,6 @@ def share_heaps() -> None:
     """
     with suppress(AttributeError):
         ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of malloc.h; with one heap threads wait for each other
-
-
-@contextmanager
-def garbage_postponed() -> Iterator[None]:
-    """Postpone garbage collection within the block, and later exclude the objects that exist at its end.
-
-    For the start of a process: reference cycles among those objects are never freed.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        if was_enabled:
-            gc.enable()
 
 
 def keep_objects() -> None:

@@ -198,9 +198,9 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
     found = list(_cameras(document))
     whole = [one for one in found if _has_camera(one)]
     if not whole:
-        names = (_FX, _FY, _CX, _CY)
-        if has := max(([name for name in names if name in one.fields] for one in found), key=len, default=None):
-            missing = ", ".join(name for name in names if name not in has)
+        wanted = (_FX, _FY, _CX, _CY)
+        if has := max(([field for field in wanted if field in one.fields] for one in found), key=len, default=None):
+            missing = ", ".join(field for field in wanted if field not in has)
             raise FrameError(f"expected {missing} (or other names for them) beside {', '.join(has)}")
         raise FrameError("expected fx, fy, cx, cy, a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12")
     if isinstance(document, dict) and all(str(key).isdigit() for key in document):
