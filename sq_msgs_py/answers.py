@@ -116,10 +116,7 @@ _AS_THEY_ARE = ("id", "label", "status", "reason", "seen", "part", "score", "res
 
 
 def superquadric_array(
-    bodies: SuperquadricArray,
-    covariances: np.ndarray,
-    header: Any,
-    parts: SuperquadricArray,
+    bodies: SuperquadricArray, covariances: np.ndarray, header: Any, parts: SuperquadricArray,
     types: MessageTypes = installed,
 ) -> Any:
     """Return the sq_msgs/SuperquadricArray of bodies (n,), covariances (n, 6, 6) of their poses, and their parts.
@@ -154,14 +151,10 @@ def _superquadrics(bodies: SuperquadricArray, covariances: np.ndarray, types: Me
 
     return [
         kind(
-            pose=posed(pose=pose, covariance=covariances[k].ravel().tolist()),
-            half_size=xyz(bodies.size[k].tolist()),
-            sigma_half_size=xyz(bodies.sigma_size[k].tolist()),
-            exponents=bodies.shape[k].tolist(),
-            sigma_exponents=np.asarray(bodies.sigma_shape)[k].tolist(),
-            taper=bodies.taper[k].tolist(),
-            fused=bool(np.asarray(bodies.fused)[k]),
-            **{name: getattr(bodies, name)[k].item() for name in _AS_THEY_ARE},
+            pose=posed(pose=pose, covariance=covariances[k].ravel().tolist()), half_size=xyz(bodies.size[k].tolist()),
+            sigma_half_size=xyz(bodies.sigma_size[k].tolist()), exponents=bodies.shape[k].tolist(),
+            sigma_exponents=np.asarray(bodies.sigma_shape)[k].tolist(), taper=bodies.taper[k].tolist(),
+            fused=bool(np.asarray(bodies.fused)[k]), **{name: getattr(bodies, name)[k].item() for name in _AS_THEY_ARE},
         )
         for k, pose in enumerate(poses_at(bodies.translation, bodies.rotation.astype(float), types))
     ]

@@ -16,6 +16,7 @@ camera that moves therefore wants its results in a frame that does not (``target
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import cache
 from itertools import compress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,16 +33,6 @@ if TYPE_CHECKING:
 
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (k, 3) and faces (m, 3)."""
-_STEP = 0.002
-"""Metres: a body of which no point has moved farther is not sent again to planners, whose paddings are larger."""
-_HEIGHTS = (np.arange(128) + 0.5) / 128
-_TURNS = np.pi * (1 + np.sqrt(5)) * np.arange(128)
-_DIRECTIONS = np.stack(
-    [np.sqrt(1 - _HEIGHTS**2) * np.cos(_TURNS), np.sqrt(1 - _HEIGHTS**2) * np.sin(_TURNS), _HEIGHTS], axis=1
-)
-"""Of one half of the sphere, as bodies are symmetric, 13 degrees apart."""
-_AGAIN, _MOST_GONE = 2, 100
-"""Repetitions that remove a body that is gone, as a planner may be busy when the first one comes, and of how many."""
 
 
 class _Known(NamedTuple):
@@ -86,14 +77,8 @@ class Scene:
         self._gone = {key: left - 1 for key, left in self._gone.items() if left > 1}
 
     def changes(
-        self,
-        superquadrics: SuperquadricArray,
-        header: Any,
-        hidden: Iterable[int] = (),
-        *,
-        rests: bool = True,
-        meshes: Callable[[], Sequence[Mesh]] | None = None,
-        prefix: str = PREFIX,
+        self, superquadrics: SuperquadricArray, header: Any, hidden: Iterable[int] = (), *, rests: bool = True,
+        meshes: Callable[[], Sequence[Mesh]] | None = None, prefix: str = PREFIX,
     ) -> list[CollisionObject]:
         """Objects to ADD and to REMOVE after another frame, by :func:`collision_objects` and :func:`removals`.
 
@@ -122,8 +107,9 @@ class Scene:
         kept = {*names, *unseen}
         gone = self._known.keys() - kept
         objects += removals((gone | self._gone_again) - kept, header)
-        late = [*((key, left) for key, left in self._gone.items() if key not in gone), *((key, _AGAIN) for key in gone)]
-        self._gone, self._gone_again = dict(late[-_MOST_GONE:]), frozenset()
+        # Twice more, as a planner may be busy when the first one comes; of a hundred at most.
+        late = [*((key, left) for key, left in self._gone.items() if key not in gone), *((key, 2) for key in gone)]
+        self._gone, self._gone_again = dict(late[-100:]), frozenset()
         self._known = {key: known for key, known in self._known.items() if key in kept}
         self._known.update({names[k]: _Known(one, shown.where(np.arange(len(shown)) == k)) for k, one in sent.items()})
         return objects
@@ -145,22 +131,25 @@ def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: i
     """
     if known is None:
         return True
-    before, now = _reach(known, 0), _reach(shown, k)
-    shift = np.abs(_DIRECTIONS @ (shown.translation[k] - known.translation[0]))
-    return bool((shift + np.abs(now - before)).max() > _STEP)
+    directions = _half_sphere()
+    before, now = (
+        support(directions @ matrices(unit_quaternions(of.rotation[i])), of.size[i], of.shape[i], of.taper[i])
+        for of, i in ((known, 0), (shown, k))
+    )
+    shift = np.abs(directions @ (shown.translation[k] - known.translation[0]))
+    return bool((shift + np.abs(now - before)).max() > 0.002)  # metres: planners' paddings are larger
 
 
-def _reach(bodies: SuperquadricArray, k: int) -> np.ndarray:
-    turn = matrices(unit_quaternions(bodies.rotation[k]))
-    return support(_DIRECTIONS @ turn, bodies.size[k], bodies.shape[k], bodies.taper[k])
+@cache
+def _half_sphere(count: int = 128) -> np.ndarray:
+    """Return directions (n, 3) of one half of the sphere, as bodies are symmetric, 13 degrees apart."""
+    height, turn = (np.arange(count) + 0.5) / count, np.pi * (1 + np.sqrt(5)) * np.arange(count)
+    across = np.sqrt(1 - height**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1)
 
 
 def collision_objects(
-    superquadrics: SuperquadricArray,
-    header: Any,
-    *,
-    meshes: Sequence[Mesh] | None = None,
-    prefix: str = PREFIX,
+    superquadrics: SuperquadricArray, header: Any, *, meshes: Sequence[Mesh] | None = None, prefix: str = PREFIX
 ) -> list[CollisionObject]:
     """Return one object to ADD for each body that did not fail; one of the same id that is there already is replaced.
 

@@ -36,8 +36,6 @@ _DTYPES: dict[str, type[Any]] = {
     "32SC1": np.int32,
     "32FC1": np.float32,
 }
-_LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1e-2, 1e6
-"""What no camera goes beyond; lines of sight computed with less or more are no longer numbers."""
 
 
 class ImageError(ValueError):
@@ -215,10 +213,11 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
             f"camera_info: expected focal lengths above 0, got fx = {fx:g}, fy = {fy:g}"
             + (" (the camera is not calibrated)" if fx == 0.0 and fy == 0.0 else "")
         )
-    if min(fx, fy) < _LEAST_FOCAL_LENGTH or max(fx, fy, abs(cx), abs(cy)) > _MOST_PIXELS:
+    least, most = 1e-2, 1e6  # beyond, lines of sight are no longer numbers
+    if min(fx, fy) < least or max(fx, fy, abs(cx), abs(cy)) > most:
         raise ImageError(
-            f"camera_info: expected focal lengths of {_LEAST_FOCAL_LENGTH:g} to {_MOST_PIXELS:g} pixels and a "
-            f"principal point within {_MOST_PIXELS:g}, got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
+            f"camera_info: expected focal lengths of {least:g} to {most:g} pixels and a "
+            f"principal point within {most:g}, got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
         )
     width, height = int(message.width), int(message.height)
     region = message.roi
@@ -228,11 +227,7 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
     if width // across < 1 or height // down < 1:
         raise ImageError(f"camera_info: expected an image of at least 1 x 1, got {message.width} x {message.height}")
     return Intrinsics(
-        width=width // across,
-        height=height // down,
-        fx=fx / across,
-        fy=fy / down,
-        cx=(cx - region.x_offset) / across,
+        width=width // across, height=height // down, fx=fx / across, fy=fy / down, cx=(cx - region.x_offset) / across,
         cy=(cy - region.y_offset) / down,
     )
 
@@ -265,12 +260,7 @@ def _to_message(pixels: np.ndarray, header: Any, encoding: str, types: MessageTy
     little = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
     height, width = pixels.shape
     message: Image = types("sensor_msgs/msg/Image")(
-        header=header,
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=0,
-        step=width * pixels.dtype.itemsize,
+        header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=width * pixels.dtype.itemsize
     )
     message.data = byte_array(little)  # the constructor of rclpy's class would copy it twice
     return message

@@ -76,14 +76,8 @@ APPROACH, LEAST_APPROACH = 0.1, 0.05
 
 
 def moveit_grasps(
-    grasps: GraspArray,
-    header: Any,
-    link: str,
-    link_from_tcp: tuple[Sequence[float], Sequence[float]],
-    up: Sequence[float] | None,
-    prefix: str,
-    joints: Sequence[str] = (),
-    types: MessageTypes = installed,
+    grasps: GraspArray, header: Any, link: str, link_from_tcp: tuple[Sequence[float], Sequence[float]],
+    up: Sequence[float] | None, prefix: str, joints: Sequence[str] = (), types: MessageTypes = installed,
 ) -> list[Grasp]:
     """Return a moveit_msgs/Grasp for each, in the same order; its quality is the score.
 

@@ -41,20 +41,11 @@ PALETTE = np.array(
 
 ALPHA = 0.7
 """Opacity of surfaces unless given."""
-_OUTLINE_COLOUR = np.array([0.05, 0.05, 0.05, 1.0])
-_LINE_WIDTH = 0.002
-"""Of outlines, metres."""
 
 
 def markers(
-    meshes: Sequence[Mesh],
-    ids: Sequence[int],
-    header: Any,
-    *,
-    colours: np.ndarray | None = None,
-    alpha: float = ALPHA,
-    namespace: str = "superquadrics",
-    types: MessageTypes = installed,
+    meshes: Sequence[Mesh], ids: Sequence[int], header: Any, *, colours: np.ndarray | None = None, alpha: float = ALPHA,
+    namespace: str = "superquadrics", types: MessageTypes = installed,
 ) -> MarkerArray:
     """Return markers of n bodies, which replace all earlier ones.
 
@@ -81,26 +72,23 @@ def markers(
     def marker(kind: str, number: int, shape: int, colour: np.ndarray, scale: Any, points: list[Any]) -> Any:
         red, green, blue, opacity = (float(channel) for channel in colour)
         return make_marker(
-            header=header,
-            ns=f"{namespace}/{kind}",
-            id=number,
-            type=shape,
-            action=_ADD,
-            pose=nowhere,
-            scale=scale,
-            color=types("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity),
-            points=points,
+            header=header, ns=f"{namespace}/{kind}", id=number, type=shape, action=_ADD, pose=nowhere, scale=scale,
+            color=types("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity), points=points,
         )
 
-    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=_LINE_WIDTH)
+    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=0.002)
+    black = np.array([0.05, 0.05, 0.05, 1.0])
     found = [make_marker(header=header, action=_DELETE_ALL)]
     for number, (surface_vertices, surface_faces, outline), colour in zip(ids, meshes, paint, strict=True):
         vertices, faces = checked_mesh(surface_vertices, surface_faces)
         corners = [point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
         found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
-        lines = [point(x=x, y=y, z=z) for x, y, z in _checked_outline(outline).tolist()]
-        found.append(marker("outline", number, _LINE_LIST, _OUTLINE_COLOUR, as_wide, lines))
+        segments = np.asarray(outline, dtype=float)
+        if segments.size and (segments.ndim != 3 or segments.shape[1:] != (2, 3)):
+            raise ValueError(f"outline: expected segments (j, 2, 3), got {segments.shape}")
+        lines = [point(x=x, y=y, z=z) for x, y, z in segments.reshape(-1, 3).tolist()]
+        found.append(marker("outline", number, _LINE_LIST, black, as_wide, lines))
     return types("visualization_msgs/msg/MarkerArray")(markers=found)
 
 
@@ -112,10 +100,3 @@ def checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError(f"faces: expected indices 0 to {len(vertices) - 1}, got {faces.min()} to {faces.max()}")
     return vertices, faces
-
-
-def _checked_outline(outline: np.ndarray) -> np.ndarray:
-    outline = np.asarray(outline, dtype=float)
-    if outline.size and (outline.ndim != 3 or outline.shape[1:] != (2, 3)):
-        raise ValueError(f"outline: expected segments (j, 2, 3), got {outline.shape}")
-    return outline.reshape(-1, 3)

@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from vision_msgs.msg import Detection3DArray
 
 
-
 def pose_messages(superquadrics: SuperquadricArray) -> list[Pose]:
     """Return the pose of each of n bodies in the frame of their header; ValueError for a quaternion of length 0."""
     return poses_at(superquadrics.translation, unit_quaternions(superquadrics.rotation))
@@ -46,8 +45,7 @@ def move(superquadrics: SuperquadricArray, rotation: np.ndarray, translation: np
     """
     turn, shift = _motion(rotation, translation)
     return replace(
-        superquadrics,
-        translation=superquadrics.translation.astype(float) @ matrices(turn).T + shift,
+        superquadrics, translation=superquadrics.translation.astype(float) @ matrices(turn).T + shift,
         rotation=product(turn, unit_quaternions(superquadrics.rotation)),
     )
 
@@ -186,11 +184,7 @@ def transforms(superquadrics: SuperquadricArray, header: Any, *, prefix: str = P
 
 
 def detections(
-    superquadrics: SuperquadricArray,
-    header: Any,
-    *,
-    covariances: np.ndarray | None = None,
-    prefix: str = PREFIX,
+    superquadrics: SuperquadricArray, header: Any, *, covariances: np.ndarray | None = None, prefix: str = PREFIX
 ) -> Detection3DArray:
     """Return a Detection3D of vision_msgs 4 for each body that did not fail; ``covariances`` (n, 6, 6) of all bodies.
 

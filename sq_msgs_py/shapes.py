@@ -31,10 +31,6 @@ if TYPE_CHECKING:
     from shape_msgs.msg import Mesh, SolidPrimitive
 
 BOX, CYLINDER, SPHERE = "box", "cylinder", "sphere"
-_SECTIONS = 257
-"""Sections of a tapered body whose support is looked at: the largest one is missed by less than 1e-4 of it."""
-_LEAST_AREA = 1e-12
-"""Of a triangle that counts, for a body of half sizes 1: smaller ones have no normal."""
 
 
 @dataclass(frozen=True)
@@ -104,10 +100,7 @@ def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
 
 
 def enclosing_factor(
-    vertices: np.ndarray,
-    faces: np.ndarray,
-    size: np.ndarray,
-    shape: np.ndarray,
+    vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, shape: np.ndarray,
     taper: np.ndarray | tuple[float, float] = (0.0, 0.0),
 ) -> float:
     """Return by how much a mesh of points on a body must grow about the centre to enclose it, at least 1.
@@ -125,7 +118,7 @@ def enclosing_factor(
     corners = (vertices / size)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)
-    is_face = area > _LEAST_AREA
+    is_face = area > 1e-12  # smaller ones have no normal
     if not is_face.any():
         raise ValueError("mesh: expected faces of an area above 0")
     normals = normals[is_face] / area[is_face, None]
@@ -148,7 +141,7 @@ def support(
 def _of_sections(normals: np.ndarray, shape: tuple[float, float], taper: np.ndarray) -> np.ndarray:
     """Support (n,) of a tapered body of half sizes 1: the largest one of its sections along its z axis."""
     e1, e2 = shape
-    angle = np.linspace(-0.5 * pi, 0.5 * pi, _SECTIONS)
+    angle = np.linspace(-0.5 * pi, 0.5 * pi, 257)  # the largest one is missed by less than 1e-4 of it
     high = np.sign(angle) * np.abs(np.sin(angle)) ** e1
     scale = (1 + taper * high[:, None]) / (1 + np.abs(taper))
     x, y, z = normals.T

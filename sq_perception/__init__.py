@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.files.version import __version__
+from sq_perception.files import __version__
 
 if TYPE_CHECKING:
     from sq_perception.evaluation.recovery_figure import recovery_figure

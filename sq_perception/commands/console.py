@@ -69,9 +69,7 @@ class Parser(argparse.ArgumentParser):
 def parser(command: str, description: str, epilog: str | None = None) -> argparse.ArgumentParser:
     """Make the parser of one command, whose texts keep their lines."""
     return Parser(
-        prog=f"sq-perception {command}",
-        description=description,
-        epilog=epilog,
+        prog=f"sq-perception {command}", description=description, epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 
@@ -149,8 +147,7 @@ def folder(text: str) -> Path:
 
 
 def replaced_input(
-    inputs: Sequence[Path],
-    files: Mapping[str, str | Path | None],
+    inputs: Sequence[Path], files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,
 ) -> str:
     """Complain if an output would replace an input; empty if none would.
@@ -168,46 +165,22 @@ def replaced_input(
     return ""
 
 
-def add_frames(command: argparse.ArgumentParser) -> None:
-    """Add the arguments for recorded frames and their recovery."""
-    add = command.add_argument
-    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
-    add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
-    add(
-        "--camera-info",
-        metavar="FILE",
-        help="intrinsics of images and bags, before their own: a file of K, or fx,fy,cx,cy",
-    )
-    add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
-    add("--camera-info-topic", metavar="NAME", help="camera_info topic, if it is not beside the depth topic")
-    add_depth(command)
-    add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
-    methods = ("auto", "network", "symmetry", "classic")
-    add("--method", choices=methods, default="auto", help="recovery method, see recover --help")
-    add_ignore_masks(command)
-
-
 def add_depth(command: argparse.ArgumentParser) -> None:
-    """Add the options for the meaning of depth values."""
+    """Add the options for the meaning of depth values and masks."""
     command.add_argument(
-        "--depth-scale",
-        type=positive,
-        metavar="N",
+        "--depth-scale", type=positive, metavar="N",
         help="units per metre (default: from a camera file, else 1000 for integers, 1 for floats)",
     )
     command.add_argument(
-        "--depth-kind",
-        choices=("z", "range"),
-        default="z",
+        "--depth-kind", choices=("z", "range"), default="z",
         help="range: images hold the distance to the camera's centre (Isaac's distance_to_camera), not z",
     )
     command.add_argument(
-        "--frame",
-        type=_cloud_frame,
-        metavar="POSE",
+        "--frame", type=_cloud_frame, metavar="POSE",
         help="for clouds in another frame, where the camera is in it: X,Y,Z (it looks at the middle), "
         "X,Y,Z,QX,QY,QZ,QW, or link (x forward, z up) or graphics (y up, z backward)",
     )
+    command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
 def _cloud_frame(text: str) -> CloudFrame:
@@ -217,11 +190,6 @@ def _cloud_frame(text: str) -> CloudFrame:
         return CloudFrame.parse(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
-
-
-def add_ignore_masks(command: argparse.ArgumentParser) -> None:
-    """Add the option that ignores the labels of frames."""
-    command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
 def progress() -> Progress:

@@ -84,15 +84,6 @@ def _report(shots: Sequence[Shot], into: Path) -> None:
         share = 100 * len(overlaps) / count
         print(f"{title:15}{share:7.0f} %{np.mean(overlaps):9.1f} %{min(overlaps):6.0f} %{delay:15.0f} ms")
     last = shots[-1]
-    columns = {title: match(last.truth, last.found[node]) for node, title in _METHODS.items()}
-    print("\nthe last image, full edges in mm, shortest first")
-    print(f"   {'true':22}" + "".join(f"{title:30}" for title in columns))
-    for k, body in enumerate(last.truth):
-        cells = [
-            f"{_edges(found):22}{100 * overlap:3.0f} %" if found is not None else "not found"
-            for found, overlap in (pairs[k] for pairs in columns.values())
-        ]
-        print(f"{k}  {_edges(body):22}" + "".join(f"{cell:30}" for cell in cells).rstrip())
     methods = {title: list(last.found[node]) for node, title in _METHODS.items()}
     figure = demo_figure(last.depth, TABLE_CAMERA, list(last.truth), methods)
     picture, bodies = save(figure, into / "demo.png"), last.found["recover_node"]
@@ -110,7 +101,3 @@ def match(truth: Superquadric, found: Superquadric) -> list[tuple[Superquadric |
         best = max(range(len(overlaps)), key=overlaps.__getitem__, default=None)
         pairs.append((None, 0.0) if best is None or not overlaps[best] else (found[best], overlaps[best]))
     return pairs
-
-
-def _edges(body: Superquadric) -> str:
-    return " x ".join(f"{2e3 * half:.0f}" for half in sorted(body.size))

@@ -45,9 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     command = parser("fit", HELP, EPILOG)
     add = command.add_argument
     add("files", nargs="+", metavar="FILE", help="clouds or meshes of one object each")
-    add(
-        "--most", type=at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)"
-    )
+    add("--most", type=at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)")
     add("--sigma", type=positive, metavar="S", help="noise of the points in their unit (default: estimated)")
     add("--no-taper", action="store_true", help="fit no taper (one body only)")
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
@@ -58,8 +56,6 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    import numpy as np
-
     from sq_perception.files import output_file
     from sq_perception.files.unpacking import UnpackingError
     from sq_perception.recordings.cloud_file import read_surface
@@ -80,8 +76,7 @@ def _run(options: argparse.Namespace) -> int:
             for number, body in enumerate(entry["superquadrics"]):
                 print(f"  {number} {_line(body)}")
     if options.json:
-        document = {"format": FORMAT, "version": VERSION, "files": entries}
-        text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist) + "\n"
+        text = json.dumps({"format": FORMAT, "version": VERSION, "files": entries}, indent=1, allow_nan=False) + "\n"
         if options.json == STANDARD_OUTPUT:
             sys.stdout.write(text)
         elif entries:
@@ -102,16 +97,18 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
     else:
         whole = fit = fit_points(points, normals, taper=not options.no_taper, sigma=options.sigma)
         fits, shares = [fit], [fit.inlier_share]
-    bodies = [_entry(fit, share) for fit, share in zip(fits, shares, strict=True)]
-    return {
+    entry = {
         "file": name,
         "points": len(points),
         "status": whole.status.name.lower(),
         "message": whole.message,
-        "noise": _finite(whole.noise),
+        "noise": whole.noise,
         "ms": round(whole.milliseconds, 3),
-        "superquadrics": bodies,
+        "superquadrics": [_entry(fit, share) for fit, share in zip(fits, shares, strict=True)],
     }
+    # Plain numbers and lists for those of NumPy, and null for NaN and infinity, which JSON does not know.
+    plain: dict[str, Any] = json.loads(json.dumps(entry, default=lambda it: it.tolist()), parse_constant=lambda _: None)
+    return plain
 
 
 def _entry(fit: Any, share: float) -> dict[str, Any]:
@@ -124,9 +121,9 @@ def _entry(fit: Any, share: float) -> dict[str, Any]:
         "taper": body.taper,
         "translation": body.translation,
         "rotation": body.rotation,
-        "sigma_size": [_finite(value) for value in fit.sigma_size],
-        "covariance": [[_finite(value) for value in row] for row in fit.covariance],
-        "share": _finite(share),
+        "sigma_size": fit.sigma_size,
+        "covariance": fit.covariance,
+        "share": share,
     }
 
 
@@ -136,7 +133,3 @@ def _line(body: dict[str, Any]) -> str:
     at = " ".join(f"{value:.3f}" for value in body["translation"])
     share = "" if body["share"] is None else f", {body['share']:.0%} of the points"
     return f"{body['status']} {edges} ({doubts}) at {at}{share}"
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if abs(value) < float("inf") else None

@@ -70,11 +70,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _plan_all(
-    recorded: RecordedInput,
-    recoverer: Recoverer,
-    hand: Gripper,
-    friction: float,
-    options: argparse.Namespace,
+    recorded: RecordedInput, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace,
     entries: list[dict[str, Any]],
 ) -> tuple[int, bool]:
     """Append the elements of ``frames`` to ``entries``; return the exit code and whether all frames were tried."""

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sq_perception.commands.console import FAILURE, SUCCESS, parser
-from sq_perception.files.version import __version__
+from sq_perception.files import __version__
 
 _WARM_UP_HELP = "Compile all kernels and keep them on disk (a minute or two), so that the first image does not wait."
 

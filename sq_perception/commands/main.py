@@ -16,14 +16,14 @@ from collections.abc import Sequence
 from pkgutil import resolve_name
 
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, Parser, complain, show_log
-from sq_perception.files.version import __version__
+from sq_perception.files import __version__
 from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {
     "sample": ("rendering:sample", "write a simulated depth image to begin with"),
-    "recover": ("recover:main", "depth images in, superquadrics out"),
+    "recover": ("recover:recover", "depth images in, superquadrics out"),
     "fit": ("fit:main", "clouds or meshes of single objects in, superquadrics out"),
-    "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
+    "grasp": ("recover:grasp", "depth images in, grasps of a parallel gripper out"),
     "render": ("rendering:render", "draw a superquadric as a depth image"),
     "demo": ("demo:main", "a simulated camera and real ROS 2 nodes (extra 'ros')"),
     "train": ("training:train", "train a network"),
@@ -31,7 +31,7 @@ COMMANDS = {
     "train-things": ("training:train_things", "train the network that predicts the unseen side of things"),
     "segment-views": ("training:segment_views", "draw segments of simulated scenes to train on"),
     "train-masks": ("training:train_masks", "train the network that finds outliers in segments"),
-    "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
+    "evaluate": ("training:evaluate", "the thesis' tables and plots, for networks and fits"),
     "doctor": ("installation:doctor", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("installation:warm_up", "compile all kernels in advance"),
 }
@@ -96,8 +96,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = Parser(
         prog="sq-perception",
         description="Superquadrics from depth images: size, shape, pose and uncertainty of the objects in them.",
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"sq-perception {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

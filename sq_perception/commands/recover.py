@@ -1,4 +1,4 @@
-"""``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
+"""``sq-perception recover`` and ``grasp``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
 
 Outputs are checked before the first frame is read, and existing files are kept until a complete result replaces them
 (:mod:`sq_perception.commands.recover_outputs`).
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sq_perception.commands.console import (
-    add_frames,
+    add_depth,
     at_least,
     folder,
     number,
@@ -77,40 +77,36 @@ camera files:
   a text or NPZ of K or fx fy cx cy.  If the file has no size, the image's is used.  A depth_scale in it is applied.
 
 distortion:
-  If a camera_info has nonzero distortion coefficients, --distortion auto treats images as rectified if the last two
-  parts of their topic or path contain the word rect or rectified (image_rect, image_rect_raw, rect/image.png), and
-  otherwise rectifies them: their camera is then that of K, in a window that shows what the raw image shows.
-  models: plumb_bob, rational_polynomial, equidistant.
+  If a camera_info has nonzero distortion coefficients (plumb_bob, rational_polynomial, equidistant), --distortion auto
+  treats images as rectified if the last two parts of their topic or path contain the word rect or rectified
+  (image_rect, image_rect_raw, rect/image.png), and otherwise rectifies them.
 
-tracking:
-  --track follows bodies over the frames of each bag and folder, for a static camera (docs/tracking.md); "track" has the
-  numbers fused so far.  With --jobs each frame is recovered independently.
-
-several cameras:
+several frames:
+  --track follows bodies over the frames of each bag and folder, for a static camera (docs/tracking.md).
   --poses FILE fuses all frames as views of one static scene and prints the result at the end, in the world of the poses
   ("scene" in --json).  FILE has one line per frame as in TUM RGB-D: NAME tx ty tz qx qy qz qw, camera to world in
   metres; NAME is the frame's file, its topic or its stamp in seconds.
 
-bags:
+bags, meshes, obstacles:
   --mcap writes what recover_node would have published and read (docs/bags.md).
-
-meshes:
-  One file per frame with all its bodies, in metres, coloured as in the pictures; none for a frame without bodies.  PLY
-  has the coordinates of the JSON.  GLB, whose y axis points up, turns them by 180 degrees about x and names each body
-  by its index in "superquadrics": body_0, body_1, ...
-
-obstacles:
-  --export writes one file per frame for planners and simulators, in metres, in the frame of the JSON.  Each body is
-  the smallest enclosing box, cylinder, sphere or capsule (not in URDF); --inflate enlarges it by its uncertainty.
-  Meshes of URDF and SDF are STL files beside it.
+  --meshes and --export write a file per frame with bodies, in metres; PLY and obstacles have the coordinates of the
+  JSON, GLB (y up) turns them by 180 degrees about x.  Each obstacle is the smallest enclosing box, cylinder, sphere or
+  capsule (not in URDF); --inflate enlarges it by its uncertainty.  Meshes of URDF and SDF are STL files beside it.
 """
 
 
-def main(arguments: Sequence[str]) -> int:
+def recover(arguments: Sequence[str]) -> int:
     """Run ``sq-perception recover``; return the exit code."""
     command = parser("recover", HELP, EPILOG)
-    add_frames(command)
     add = command.add_argument
+    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
+    add("--camera-info", metavar="FILE", help="intrinsics of images and bags, before their own: a file, or fx,fy,cx,cy")
+    add("--topic", metavar="NAME", help="depth topic of a bag, if it has several")
+    add("--camera-info-topic", metavar="NAME", help="camera_info topic, if it is not beside the depth topic")
+    add_depth(command)
+    add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
+    add("--method", choices=("auto", "network", "symmetry", "classic"), default="auto", help="see below")
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     add("--jsonl", type=text_target, metavar="OUT", help="append a line per frame, skip those already there, see below")
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
@@ -118,17 +114,13 @@ def main(arguments: Sequence[str]) -> int:
     add("--depth-min", type=float, default=0.0, metavar="M", help="metres; ignore nearer readings")
     add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; ignore farther readings")
     add(
-        "--roi",
-        type=_region,
-        metavar="X,Y,W,H",
+        "--roi", type=_region, metavar="X,Y,W,H",
         help="use only this part of each image, in pixels, after rectification",
     )
     masks = "label images NAME.png, 0 is background, or binary ones, NAME_000000.png ... (BOP)"
     add("--masks", type=_existing, metavar="DIR", help=masks)
     add(
-        "--distortion",
-        choices=("auto", "apply", "ignore"),
-        default="auto",
+        "--distortion", choices=("auto", "apply", "ignore"), default="auto",
         help="rectify images, assume they are rectified, or decide by their names; see below",
     )
     add("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
@@ -141,17 +133,12 @@ def main(arguments: Sequence[str]) -> int:
     add("--export-folder", type=folder, metavar="DIR", default=Path(), help="folder of the scenes (default: here)")
     add("--export-meshes", action="store_true", help="as close meshes instead of enclosing solids")
     add(
-        "--inflate",
-        type=number("a number from 0", lambda value: value >= 0),
-        default=0.0,
-        metavar="K",
+        "--inflate", type=number("a number from 0", lambda value: value >= 0), default=0.0, metavar="K",
         help="enlarge them by K standard deviations",
     )
     add("--mcap", type=target, metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
     add(
-        "--mcap-images",
-        metavar="LIST",
-        default="depth",
+        "--mcap-images", metavar="LIST", default="depth",
         help="images of the bag, comma separated: depth (default), rendered, labels, or none",
     )
     add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
@@ -159,17 +146,11 @@ def main(arguments: Sequence[str]) -> int:
     add("--poses", type=Path, metavar="FILE", help="camera poses of frames that show one scene, see below")
     add("--parts", action="store_true", help="also recover the parts of objects that one body does not explain")
     add(
-        "--time-budget",
-        type=positive,
-        default=math.inf,
-        metavar="S",
+        "--time-budget", type=positive, default=math.inf, metavar="S",
         help="seconds per frame after which fits try no further start",
     )
     add(
-        "--jobs",
-        type=at_least(1),
-        default=1,
-        metavar="N",
+        "--jobs", type=at_least(1), default=1, metavar="N",
         help="number of frames processed in parallel (1: the objects of one frame in parallel)",
     )
     score = number("a score from 0 to 1", lambda value: 0 <= value <= 1)
@@ -179,10 +160,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--max-objects", type=at_least(1), default=20, metavar="N", help="most objects, the largest first (default 20)")
     add("--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)")
     add(
-        "--workspace",
-        type=float,
-        nargs=6,
-        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        "--workspace", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box in the optical frame, metres, for the centres of objects",
     )
     options = command.parse_args(with_negatives(arguments))
@@ -190,6 +168,48 @@ def main(arguments: Sequence[str]) -> int:
     from sq_perception.commands import recover_run
 
     return recover_run.run(options)
+
+
+GRASP_HELP = """\
+Plan grasps of a parallel gripper on the objects of recorded depth images.
+
+A FRAME is what 'sq-perception recover' reads: an .npz with depth and K, a PNG with a camera beside it, a folder, a bag.
+"""
+GRASP_EPILOG = """\
+output:
+  {"format": "sq_perception.grasps", "version": 1, "options": {...},
+   "frames": [{"file": ..., "stamp": {"sec": ..., "nanosec": ...}, "bodies": [{"body": ..., "label": ..., "reason": ...,
+   "grasps": [{"position": [x, y, z], "rotation": [x, y, z, w], "opening": ..., "width": ..., "score": ...,
+   "weakest": ...}, ...]}, ...]}, ...]}
+  Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z is the approach, y
+  the closing direction.  "score" is the probability that the grasp holds, best first; "weakest" its smallest factor.
+  Bodies are numbered as in `recover`; one without a grasp has a reason.  The stamp is null if the frame has none.
+
+examples:
+  sq-perception grasp table.npz --json grasps.json --pictures pictures/
+  sq-perception grasp depth_1.png --camera-info camera.yaml --gripper robotiq_2f_85 --meshes meshes/
+"""
+
+
+def grasp(arguments: Sequence[str]) -> int:
+    """Run ``sq-perception grasp``; return the exit code."""
+    command = parser("grasp", GRASP_HELP, GRASP_EPILOG)
+    add = command.add_argument
+    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    add("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
+    add("--parts", action="store_true", help="grasp objects of several bodies by their parts: handles, necks, stems")
+    add("--friction", type=positive, help="smallest friction coefficient between pads and objects (default 0.5)")
+    add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
+    add("--topic", metavar="TOPIC", help="depth topic of a bag, if it has several")
+    add_depth(command)
+    add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
+    add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
+    add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
+    options = command.parse_args(with_negatives(arguments))
+
+    from sq_perception.commands import grasp_run
+
+    return grasp_run.run(options)
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

@@ -226,12 +226,8 @@ def _write_scene(path: Path, frame: RecordedFrame, recovery: FrameRecovery, opti
         covariances = np.array([body.covariance for body in bodies])
         stack = Superquadric.stack([body.superquadric for body in bodies])
         scene_export.write(
-            scene_export.inflate(stack, covariances, options.inflate),
-            path,
-            options.export,
-            names=[f"body_{k}" for k in shown],
-            frame=CAMERA_FRAME,
-            meshes=options.export_meshes,
+            scene_export.inflate(stack, covariances, options.inflate), path, options.export,
+            names=[f"body_{k}" for k in shown], frame=CAMERA_FRAME, meshes=options.export_meshes,
         )
     except ValueError as error:
         raise FrameError(f"{frame.name}: --export: {error}") from error

@@ -28,8 +28,7 @@ from sq_perception.learning import checkpoint
 from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
-from sq_perception.recordings.inputs import RecordedInput
-from sq_perception.recordings.tracks import CameraPoses, RecordedTracks, sequence_of
+from sq_perception.recordings.inputs import CameraPoses, RecordedInput, RecordedTracks, sequence_of
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
@@ -135,11 +134,8 @@ class RecoverRun:
         self.is_whole = False
         self._options = options
         self._settings = RecoveryOptions(
-            method=options.method,
-            max_objects=options.max_objects,
-            time_budget=options.time_budget,
-            max_size=options.max_size,
-            workspace=None if options.workspace is None else tuple(options.workspace),
+            method=options.method, max_objects=options.max_objects, time_budget=options.time_budget,
+            max_size=options.max_size, workspace=None if options.workspace is None else tuple(options.workspace),
             parts=options.parts,
         )
         done = result_json.Recovered()

@@ -21,10 +21,6 @@ from sq_perception.nodes.frame import stamp_of
 from sq_perception.recordings.publication import depth_of, superquadrics
 
 IMAGE, TRUTH = "depth/image", "synthetic_depth_node/truth"
-_REMEMBERED = 40
-"""Number of images that may wait for their truth and results."""
-_PATIENCE = 600.0
-"""Seconds to wait for the first result: the first start compiles, for minutes on a slow machine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +42,10 @@ class DemoNode(Node):
 
     def __init__(self, name: str, nodes: tuple[str, ...], seconds: float) -> None:
         super().__init__(name)
+        patience = 600.0  # seconds: the first start compiles, for minutes on a slow machine
         self.start_failure = ""
         self.shots: list[Shot] = []
-        self._nodes, self._seconds, self._due = nodes, seconds, time.monotonic() + _PATIENCE
+        self._nodes, self._seconds, self._due = nodes, seconds, time.monotonic() + patience
         self._waiting: OrderedDict[int, dict[str, tuple[Any, float]]] = OrderedDict()
         fast = QoSProfile(depth=5, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         self.create_subscription(Image, IMAGE, partial(self._on_message, IMAGE), fast)
@@ -66,13 +63,13 @@ class DemoNode(Node):
             if self.shots:
                 signal.raise_signal(signal.SIGINT)
             else:
-                self.start_failure = f"no image was answered by all of {', '.join(self._nodes)} in {_PATIENCE:g} s"
+                self.start_failure = f"no image was answered by all of {', '.join(self._nodes)} in time"
 
     def _on_message(self, name: str, message: Any) -> None:
         stamp = stamp_of(message)
         parts = self._waiting.setdefault(stamp, {})
         parts[name] = message, 1e-6 * (time.time_ns() - stamp)
-        while len(self._waiting) > _REMEMBERED:
+        while len(self._waiting) > 40:
             self._waiting.popitem(last=False)
         if parts.keys() != {IMAGE, TRUTH, *self._nodes}:
             return

@@ -105,10 +105,7 @@ def _parser(name: str, positional: str = "") -> argparse.ArgumentParser:
     kind = name.replace("recover_cameras", "recover_node")
     parameters = process.configuration_file(f"{kind}.yaml").read_text(encoding="utf-8")
     return argparse.ArgumentParser(
-        prog=name,
-        usage=_USAGE.format(positional),
-        description=_ABOUT[name],
-        epilog=parameters.replace("%", "%%"),
+        prog=name, usage=_USAGE.format(positional), description=_ABOUT[name], epilog=parameters.replace("%", "%%"),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
 

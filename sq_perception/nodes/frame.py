@@ -32,8 +32,6 @@ from sq_perception.recordings.cloud_file import move
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 MaskMessage: TypeAlias = Any
 """A label image, or a yolo_msgs/DetectionArray, which is imported only where it is installed."""
-_DIGITS = 3
-"""Decimals of pixels to which a cloud's camera is rounded, so that noise does not change it between frames."""
 
 
 def newest() -> QoSProfile:
@@ -92,11 +90,8 @@ class Frame:
 
 
 def decode(
-    message: DepthMessage,
-    calibration_of: Callable[[], Calibration] | None,
-    scale: float | None = None,
-    kind: str = "z",
-    view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
+    message: DepthMessage, calibration_of: Callable[[], Calibration] | None, scale: float | None = None,
+    kind: str = "z", view: tuple[str, tuple[np.ndarray, np.ndarray]] | None = None,
 ) -> Frame:
     """Decode a depth image message; raises ValueError for anything that prevents its processing.
 
@@ -116,7 +111,8 @@ def decode(
             found = cloud_file.as_image(points, None if labels is None else cloud_file.labels_of(labels))
         except ValueError as error:
             raise ValueError(f"points in {header.frame_id or 'a frame without a name'}: {error}") from error
-        numbers = {name: round(getattr(found.camera, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
+        # Rounded, so that noise does not change it between frames.
+        numbers = {name: round(getattr(found.camera, name), 3) for name in ("fx", "fy", "cx", "cy")}
         notes = () if labels is None else (cloud_file.LABELLED,)
         calibration = Calibration(replace(found.camera, **numbers))
         return Frame(header, "32FC1", found.depth, calibration, found.labels, found.is_image, notes)

@@ -23,7 +23,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.action import ActionServer, CancelResponse
+from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
@@ -35,11 +36,10 @@ from sq_perception.nodes import process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
-from sq_perception.nodes.interfaces import RecoverInterfaces
-from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.managed_node import ManagedNode, optional
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
-from sq_perception.nodes.statistics import OLDEST, THROTTLE, Standing, Statistics
+from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.nodes.tracking import Pose as CameraPose
 from sq_perception.recordings.publication import Findings
@@ -47,10 +47,6 @@ from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
 from sq_perception.tracking import association
 
-_WORKER_END = 3.0
-"""Seconds that a deactivation waits for the current frame."""
-_DEFECTS = 10
-"""Consecutive frames that fail by a program or device error, after which the node restarts."""
 TRIGGER_TIMEOUT = 5.0
 """Seconds without a frame after which ~/trigger and ~/recover fail, beyond those that an image waits for its
 camera_info: five periods of the slowest camera in use."""
@@ -73,23 +69,16 @@ class FrameNode(ManagedNode):
     configuration, as it is read there.
     """
 
+    _action: ActionServer | None = None
+
     def __init__(
-        self,
-        name: str,
-        kind: type[RecoverParameters] = RecoverParameters,
-        *,
-        namespace: str | None = None,
-        context: Any = None,
-        defaults: Mapping[str, Any] = MappingProxyType({}),
+        self, name: str, kind: type[RecoverParameters] = RecoverParameters, *, namespace: str | None = None,
+        context: Any = None, defaults: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         super().__init__(name, namespace=namespace, context=context)
         self._engine = Engine(self)
         self._settings: LiveParameters[RecoverParameters] = LiveParameters(
-            self,
-            kind,
-            locked=self._why_locked,
-            check=self._engine.check,
-            changed=self._engine.follow,
+            self, kind, locked=self._why_locked, check=self._engine.check, changed=self._engine.follow,
             defaults=defaults,
         )
         self._statistics = Statistics()
@@ -110,7 +99,11 @@ class FrameNode(ManagedNode):
         apart = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
-        self._interfaces = RecoverInterfaces(self, self._next_outcome, apart)
+        optional(
+            self, self.create_service, "sq_msgs/srv/Recover", "~/recover_array", self._on_recover_array,
+            callback_group=apart,
+        )
+        self._action = optional(self, self._serve_images, "sq_msgs/action/Recover", apart)
         self.create_timer(1.0, self._on_second, clock=_STEADY)
         self.start(self._settings.current.autostart)
 
@@ -159,7 +152,7 @@ class FrameNode(ManagedNode):
             source.close()
         self._resolve(Outcome(False, "the node has been deactivated"))
         if self._worker is not None:
-            self._worker.join(_WORKER_END)
+            self._worker.join(3.0)
             if self._worker.is_alive():
                 self.get_logger().warning("the current frame takes long; it is the last one and is not published")
 
@@ -168,8 +161,10 @@ class FrameNode(ManagedNode):
         return super().close() and (self._worker is None or not self._worker.is_alive())
 
     def destroy_node(self) -> None:
-        """As rclpy's, with the action."""
-        self._interfaces.close()
+        """Destroy the node as rclpy does, and its action."""
+        action, self._action = self._action, None
+        if action is not None:
+            action.destroy()
         super().destroy_node()
 
     def _why_locked(self) -> str:
@@ -300,9 +295,9 @@ class FrameNode(ManagedNode):
         """Log a program error, which costs this frame only."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
         self._defects += 1
-        if self._defects == _DEFECTS:
+        if self._defects == 10:
             self._engine.discard()
-            self._fail(f"{_DEFECTS} frames in a row failed, the last one by {text}")
+            self._fail(f"10 frames in a row failed, the last one by {text}")
 
     # Services and diagnostics, in the executor's thread
 
@@ -326,6 +321,31 @@ class FrameNode(ManagedNode):
         if found is not None:
             response.message = answers.text_of(found.array, found.header, response.message)
         return response
+
+    async def _on_recover_array(self, request: Any, response: Any) -> Any:
+        response.success, response.message, found = await self._next_outcome()
+        if found is not None:
+            response.bodies = answers.superquadric_array(found.array, found.covariances, found.header, found.parts)
+        return response
+
+    def _serve_images(self, kind: Any, group: CallbackGroup) -> ActionServer:
+        async def recover_images(goal: Any) -> Any:
+            """Recover as many images as the goal asks for; the first failure ends it."""
+            result = kind.Result()
+            for _ in range(max(int(goal.request.images), 1)):
+                if goal.is_cancel_requested:
+                    goal.canceled()
+                    return result
+                result = await self._on_recover_array(None, kind.Result())
+                if not result.success:
+                    goal.abort()
+                    return result
+                goal.publish_feedback(kind.Feedback(bodies=result.bodies))
+            goal.succeed()
+            return result
+
+        accept = {"cancel_callback": lambda _: CancelResponse.ACCEPT}
+        return ActionServer(self, kind, "~/recover_images", recover_images, callback_group=group, **accept)
 
     async def _next_outcome(self) -> Outcome:
         """Return the outcome of the next frame, or why there is none."""
@@ -361,12 +381,9 @@ class FrameNode(ManagedNode):
             tally = self._tracking.tally
             more |= {"tracks": str(tally.tracks), "track ids given": str(tally.births)}
             more |= {"track resets": str(tally.resets), "frames without camera pose": str(tally.without_pose)}
-        self._diagnostics.publish(self._statistics.report(self, self._standing(silent), more))
-
-    def _standing(self, silent: bool) -> Standing | None:
-        """Return the level and message of diagnostics that do not depend on frames, if any."""
-        if (standing := self.standing(self._engine.fault)) is not None:
-            return standing
-        if not self._enabled:
-            return DiagnosticStatus.OK, "disabled"
-        return (DiagnosticStatus.WARN, "no depth images arrive") if silent else None
+        standing = self.standing(self._engine.fault)
+        if standing is None and not self._enabled:
+            standing = DiagnosticStatus.OK, "disabled"
+        elif standing is None and silent:
+            standing = DiagnosticStatus.WARN, "no depth images arrive"
+        self._diagnostics.publish(self._statistics.report(self, standing, more))

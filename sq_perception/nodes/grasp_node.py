@@ -40,9 +40,8 @@ from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import FRICTION, PLACEMENT, grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched_qos, stamp_of
-from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
-from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.managed_node import ManagedNode, optional
 from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, check_prefix, setting
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
@@ -60,10 +59,7 @@ class GraspParameters(Parameters):
 
     autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     max_age: float = setting(
-        10.0,
-        "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.",
-        unit="s",
-        within=(0.0, 3600.0),
+        10.0, "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.", unit="s", within=(0.0, 3600.0)
     )
     no_cloud_warning: float = setting(
         5.0, "Warn after this time without bodies; 0 never warns.", unit="s", within=(0.0, 3600.0)

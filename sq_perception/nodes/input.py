@@ -30,16 +30,14 @@ from sq_perception.nodes.frame import (
     listen_to_latched_info,
     stamp_of,
 )
-from sq_perception.nodes.interfaces import optional
 from sq_perception.nodes.listener import Listener
+from sq_perception.nodes.managed_node import optional
 from sq_perception.nodes.parameters import POINTS, RAW, LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
 from sq_perception.nodes.tracking import Pose
 from sq_perception.recordings.cloud_file import LABEL_FIELDS, UNORGANISED
 from sq_perception.recordings.publication import size_of
 
-_INFOS = 16
-_MASKS = 8
 _WAITING = 64
 """Images that wait for camera_info or mask at the same time; beyond them the oldest stops waiting. If it were dropped
 instead, a camera that sends so many within ``patience`` would never get an answer."""
@@ -76,10 +74,7 @@ class Input:
     """
 
     def __init__(
-        self,
-        node: Node,
-        settings: LiveParameters[RecoverParameters],
-        is_wanted: Callable[[], bool],
+        self, node: Node, settings: LiveParameters[RecoverParameters], is_wanted: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
         self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
@@ -93,7 +88,7 @@ class Input:
         """Guards the following attributes."""
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
-        self._infos: deque[_Info] = deque(maxlen=_INFOS)
+        self._infos: deque[_Info] = deque(maxlen=16)
         self._image_stamp = -1
         """Stamp of the last image."""
         self._are_paired = False
@@ -107,8 +102,7 @@ class Input:
         self._latched: Subscription | None = None
         self._mask = Listener(node, Image, "mask/image", self._on_mask, statistics)
         self._detections: Listener | None = optional(
-            node,
-            lambda kind: Listener(node, kind, "mask/detections", self._on_mask, statistics),
+            node, lambda kind: Listener(node, kind, "mask/detections", self._on_mask, statistics),
             "yolo_msgs/msg/DetectionArray",
         )
         kind = {RAW: Image, POINTS: PointCloud2}.get(transport, CompressedImage)
@@ -128,11 +122,6 @@ class Input:
     @property
     def _listeners(self) -> tuple[Listener, ...]:
         return tuple(one for one in (self._image, self._mask, self._detections, self._info) if one is not None)
-
-    @property
-    def _has_mask_publisher(self) -> bool:
-        topics = [one.topic for one in (self._mask, self._detections) if one is not None]
-        return any(self._node.count_publishers(topic) > 0 for topic in topics)
 
     @property
     def silence(self) -> float:
@@ -181,20 +170,15 @@ class Input:
                 arrival = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
             return arrival
 
-    def frame(
-        self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None
-    ) -> Frame:
+    def frame(self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None) -> Frame:
         """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.
 
         Raises ValueError for anything that keeps it from being processed.
         """
         message, use, source = arrival.message, parameters.use_masks, self._info
         frame = decode(
-            message,
-            None if source is None else lambda: self._calibration_of(message, source),
-            parameters.depth_scale or None,
-            parameters.depth_kind,
-            view,
+            message, None if source is None else lambda: self._calibration_of(message, source),
+            parameters.depth_scale or None, parameters.depth_kind, view,
         )
         if use == "never" and frame.labels is not None:
             frame = replace(frame, labels=None)
@@ -221,7 +205,7 @@ class Input:
     def _calibration_of(self, image: DepthMessage, source: Listener) -> Calibration:
         size = size_of(image)
         with self._changed:
-            info = self._info_for(size, stamp_of(image))
+            info, _ = self._info_for(size, stamp_of(image))
             last = self._infos[-1] if self._infos else None
         if info is not None and info.calibration is not None:
             return info.calibration
@@ -249,10 +233,10 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
+        topics = [one.topic for one in (self._mask, self._detections) if one is not None]
+        has_publisher = any(self._node.count_publishers(topic) > 0 for topic in topics)
         has_labels = isinstance(message, PointCloud2) and any(one.name in LABEL_FIELDS for one in message.fields)
-        needs_mask = not has_labels and (
-            use == "always" or (use == "auto" and self._has_mask_publisher)
-        )
+        needs_mask = not has_labels and (use == "always" or (use == "auto" and has_publisher))
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")
@@ -285,7 +269,7 @@ class Input:
             return
         with self._changed:
             self._masks[stamp_of(message)] = message
-            while len(self._masks) > _MASKS:
+            while len(self._masks) > 8:
                 self._masks.popitem(last=False)
             self._promote(monotonic())
 
@@ -308,21 +292,18 @@ class Input:
         if arrival.size is None:
             return True
         stamp = stamp_of(arrival.message)
-        has_info = self._info is None or self._knows_camera(arrival.size, stamp)
+        has_info = self._info is None or self._info_for(arrival.size, stamp)[1]
         return has_info and (not arrival.needs_mask or stamp in self._masks)
 
-    def _knows_camera(self, size: tuple[int, int], stamp: int) -> bool:
-        """Return whether the camera_info of an image has arrived, or an earlier one will do.
+    def _info_for(self, size: tuple[int, int], stamp: int) -> tuple[_Info | None, bool]:
+        """Return the camera_info of an image, or the latest of its size, and whether the image need not wait.
 
         Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
         another one's would shift every body.
         """
         fitting = [info for info in self._infos if info.size == size]
-        if not fitting or any(info.stamp == stamp for info in fitting):
-            return bool(fitting)
-        return not self._are_paired or all(info.calibration == fitting[0].calibration for info in fitting)
-
-    def _info_for(self, size: tuple[int, int], stamp: int) -> _Info | None:
-        fitting = [info for info in self._infos if info.size == size]
-        best = [info for info in fitting if info.stamp == stamp] or fitting
-        return best[-1] if best else None
+        if own := [info for info in fitting if info.stamp == stamp]:
+            return own[-1], True
+        if not fitting:
+            return None, False
+        return fitting[-1], not self._are_paired or all(one.calibration == fitting[0].calibration for one in fitting)

@@ -94,8 +94,7 @@ class Listener:
         self._qos = newest()
         self._qos.reliability = reliability
         events = SubscriptionEventCallbacks(
-            matched=lambda _: self.follow(),
-            incompatible_qos=lambda _: self._on_incompatible(),
+            matched=lambda _: self.follow(), incompatible_qos=lambda _: self._on_incompatible(),
             message_lost=self._on_message_lost,
         )
         overridable = QoSOverridingOptions(policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH))

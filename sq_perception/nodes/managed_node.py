@@ -35,6 +35,8 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from rclpy.node import Node
 from rclpy.task import Future
 
+from sq_msgs_py.message_types import installed
+
 _NAMES = {
     Transition.TRANSITION_CONFIGURE: "configure",
     Transition.TRANSITION_CLEANUP: "cleanup",
@@ -50,6 +52,17 @@ _PAUSE = 2.0
 """Seconds before a node that failed while active restarts."""
 _END = 4.0
 """Seconds that :meth:`ManagedNode.close` waits for a transition."""
+
+
+def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any, **more: Any) -> Any:
+    """Return what ``create`` makes of an interface package/msg/Name of sq_msgs; None if it is not installed."""
+    try:
+        return create(installed(name), *arguments, **more)
+    except ModuleNotFoundError:
+        return None
+    except Exception as error:  # a package that is there in part fails in other ways
+        node.get_logger().warning(f"{name} cannot be used: {type(error).__name__}: {error}")
+        return None
 
 
 class ManagedNode(LifecycleNodeMixin, Node):

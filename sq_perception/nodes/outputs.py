@@ -37,7 +37,7 @@ from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import detections, plane_message, transforms
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.nodes.frame import Frame, latched_qos
-from sq_perception.nodes.interfaces import optional
+from sq_perception.nodes.managed_node import optional
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
@@ -48,9 +48,7 @@ from sq_perception.recovery.recovery import timed
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 ARRIVAL = Duration(seconds=0.5)
 """Seconds that the last markers may take to arrive before their publisher is destroyed."""
-_ALL_AGAIN = 5.0
-"""Seconds between two messages of the whole planning scene: a planner receives none while it plans, its queue holds
-ten, and a lost message would leave its world wrong for good."""
+
 
 class Outputs:
     """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
@@ -135,9 +133,7 @@ class Outputs:
                 )
 
 
-def pose_in(
-    poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame"
-) -> Pose:
+def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float, parameter: str = "target_frame") -> Pose:
     """Return the pose of a header's frame in the tf2 frame of a parameter, at its stamp; ValueError if unknown."""
     try:
         return poses.at(header, frame_id, patience)
@@ -213,14 +209,12 @@ class OptionalOutputs:
         """Publish the changes of the planning scene, from time to time all of it."""
         if monotonic() >= self._all_due:
             self._scene.repeat()
-            self._all_due = monotonic() + _ALL_AGAIN
+            # A planner receives none while it plans, and a lost message would leave its world wrong for good.
+            self._all_due = monotonic() + 5.0
         if not (parameters.publish_collision_objects and found.header.frame_id):
             return
         objects = self._scene.changes(
-            found.array,
-            found.header,
-            hidden,
-            rests=bool(parameters.target_frame) or not parameters.fixed_frame,
+            found.array, found.header, hidden, rests=bool(parameters.target_frame) or not parameters.fixed_frame,
             meshes=(lambda: found.meshes) if parameters.collision_shapes == "mesh" else None,
             prefix=parameters.tf_prefix,
         )

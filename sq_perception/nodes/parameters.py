@@ -36,13 +36,8 @@ class ParameterError(ValueError):
 
 
 def setting(
-    default: Any,
-    description: str,
-    *,
-    unit: str = "",
-    within: tuple[float, float] | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = True,
+    default: Any, description: str, *, unit: str = "", within: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (), live: bool = True,
 ) -> Any:
     """Return a dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
     about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
@@ -77,11 +72,7 @@ class LiveParameters(Generic[P]):
     """
 
     def __init__(
-        self,
-        node: Node,
-        kind: type[P],
-        *,
-        locked: Callable[[], str] | None = None,
+        self, node: Node, kind: type[P], *, locked: Callable[[], str] | None = None,
         check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
         changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
         defaults: Mapping[str, Any] = MappingProxyType({}),
@@ -145,10 +136,8 @@ def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescripto
     about = parameter.metadata
     unit = about["unit"]
     descriptor = ParameterDescriptor(
-        name=parameter.name,
-        type=Parameter.Type.from_parameter_value(parameter.default).value,
-        description=about["description"] + (f" [{unit}]" if unit else ""),
-        read_only=is_fixed and not about["live"],
+        name=parameter.name, type=Parameter.Type.from_parameter_value(parameter.default).value,
+        description=about["description"] + (f" [{unit}]" if unit else ""), read_only=is_fixed and not about["live"],
     )
     if about["choices"]:
         descriptor.additional_constraints = "one of: " + ", ".join(about["choices"])
@@ -195,10 +184,8 @@ class RecoverParameters(Parameters):
 
     autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     projection: Projection = setting(
-        "pinhole",
-        "pinhole: 16UC1 and 32FC1 with camera_info; orthographic: mono8 and mono16 images of the unit cube.",
-        choices=get_args(Projection),
-        live=False,
+        "pinhole", "pinhole: 16UC1 and 32FC1 with camera_info; orthographic: mono8 and mono16 images of the unit cube.",
+        choices=get_args(Projection), live=False,
     )
     use_masks: str = setting(
         "auto",
@@ -210,15 +197,13 @@ class RecoverParameters(Parameters):
         RAW,
         "Input topic: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
         "depth/image/compressedDepth, points (sensor_msgs/PointCloud2, see docs/nodes.md) on depth/points.",
-        choices=(RAW, compressed_depth.TRANSPORT, POINTS),
-        live=False,
+        choices=(RAW, compressed_depth.TRANSPORT, POINTS), live=False,
     )
     distortion: Treatment = setting(
         "auto",
         "apply the coefficients of camera_info, ignore them, or auto: apply them unless one of the last two parts of "
         "the topic name contains the word rect or rectified.",
-        choices=get_args(Treatment),
-        live=False,
+        choices=get_args(Treatment), live=False,
     )
     depth_scale: float = setting(
         0.0,
@@ -233,8 +218,7 @@ class RecoverParameters(Parameters):
         choices=get_args(DepthKind),
     )
     s: float = setting(
-        RecoveryOptions.sharpness,
-        "Sharpness of the soft occupancy sigmoid(s (1 - F^e1)) in the score.",
+        RecoveryOptions.sharpness, "Sharpness of the soft occupancy sigmoid(s (1 - F^e1)) in the score.",
         within=(0.1, 1000.0),
     )
     tau: float = setting(
@@ -242,18 +226,13 @@ class RecoverParameters(Parameters):
     )
     depth_min: float = setting(0.0, "Ignore nearer readings.", unit="m", within=(0.0, 100.0))
     depth_max: float = setting(
-        _KEEPS_ALL,
-        f"Ignore farther readings; {_KEEPS_ALL:g} keeps all.",
-        unit="m",
-        within=(0.001, _KEEPS_ALL),
+        _KEEPS_ALL, f"Ignore farther readings; {_KEEPS_ALL:g} keeps all.", unit="m", within=(0.001, _KEEPS_ALL)
     )
     max_objects: int = setting(
         RecoveryOptions.max_objects, "Maximum number of bodies per frame; the largest are kept.", within=(1, 100)
     )
     max_size: float = setting(
-        RecoveryOptions.max_size,
-        "Largest full edge of objects that the node segments itself.",
-        unit="m",
+        RecoveryOptions.max_size, "Largest full edge of objects that the node segments itself.", unit="m",
         within=(0.01, 100.0),
     )
     workspace: tuple[float, ...] = setting(
@@ -265,16 +244,14 @@ class RecoverParameters(Parameters):
     time_budget: float = setting(
         0.0,
         "Time per frame after which fits try no further starts, the largest and nearest objects first; 0: no limit.",
-        unit="s",
-        within=(0.0, 60.0),
+        unit="s", within=(0.0, 60.0),
     )
     tracking: bool = setting(
         True,
         "Track bodies from frame to frame and fuse their numbers; false: ids are mask labels, frames are independent.",
     )
     fixed_frame: str = setting(
-        "",
-        "Static tf2 frame, for a moving camera. Empty: the camera is static. A change ends the tracks.",
+        "", "Static tf2 frame, for a moving camera. Empty: the camera is static. A change ends the tracks."
     )
     marker_alpha: float = setting(ALPHA, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
     no_frame_warning: float = setting(
@@ -291,9 +268,7 @@ class RecoverParameters(Parameters):
         "Empty: the points' frame.",
     )
     tf_tolerance: float = setting(
-        0.1,
-        "How long an image waits for transforms (camera_frame, fixed_frame, target_frame).",
-        unit="s",
+        0.1, "How long an image waits for transforms (camera_frame, fixed_frame, target_frame).", unit="s",
         within=(0.0, 5.0),
     )
     publish_tf: bool = setting(False, "Publish a frame for each body on /tf.")
@@ -316,8 +291,7 @@ class RecoverParameters(Parameters):
     device: str = setting("cpu", "Device of the network for bodies or hulls: cpu, cuda or cuda:N.")
     threads: int = setting(0, "Objects processed in parallel; 0: one per core.", within=(0, 256))
     method: Method = setting(
-        "auto",
-        "auto: network and fit; symmetry: fit only; network: network only; classic: Solina and Bajcsy's fit.",
+        "auto", "auto: network and fit; symmetry: fit only; network: network only; classic: Solina and Bajcsy's fit.",
         choices=get_args(Method),
     )
     repair: bool = setting(
@@ -335,18 +309,10 @@ class RecoverParameters(Parameters):
     def recovery_options(self, pose: Pose | None = None, has_free_space: bool = True) -> RecoveryOptions:
         """Return the options for a frame with this pose in ``target_frame``."""
         return RecoveryOptions(
-            method=self.method,
-            sharpness=self.s,
-            tau=self.tau,
+            method=self.method, sharpness=self.s, tau=self.tau,
             depth_range=(self.depth_min, math.inf if self.depth_max >= _KEEPS_ALL else self.depth_max),
-            max_objects=self.max_objects,
-            max_size=self.max_size,
-            workspace=self.box,
-            workspace_pose=pose,
-            free_space=has_free_space,
-            time_budget=self.time_budget or math.inf,
-            repair=self.repair,
-            parts=self.parts,
+            max_objects=self.max_objects, max_size=self.max_size, workspace=self.box, workspace_pose=pose,
+            free_space=has_free_space, time_budget=self.time_budget or math.inf, repair=self.repair, parts=self.parts,
         )
 
     def __post_init__(self) -> None:

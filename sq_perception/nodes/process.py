@@ -21,9 +21,9 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
@@ -37,11 +37,6 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_F
 """Spinning threads take cores from other nodes: on two busy cores a frame took 30 ms with these settings and 50 to 150
 ms without. Small solves and images gain nothing from a second thread: OpenCV's took a tenth of the processor time of a
 VGA frame of one body, and saved 2 % on an idle core."""
-_M_ARENA_MAX, _HEAPS = -8, 2
-"""The option of glibc's malloc.h, and the number of heaps: with one, threads waited for each other and a frame took 10
-% more processor time; with two it took the same as with one per thread."""
-_LOOK = 0.1
-"""Seconds between two checks for a signal."""
 
 
 _Node = TypeVar("_Node", bound="Stoppable")
@@ -84,23 +79,25 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             for variable, value in {**_THREADS, **additions()}.items():
                 os.environ.setdefault(variable, value)
             share_heaps()
-            with garbage_postponed():
-                import rclpy
-                from rclpy.executors import SingleThreadedExecutor
-                from rclpy.signals import SignalHandlerOptions
+            gc.disable()
+            import rclpy
+            from rclpy.executors import SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
 
-                from sq_perception.geometry.threads import TURN
+            from sq_perception.geometry.threads import TURN
 
-                sys.setswitchinterval(TURN)  # services waited behind the threads that fit
+            sys.setswitchinterval(TURN)  # services waited behind the threads that fit
 
-                # rclpy's own handlers end the context from another thread, and give way to the default action for an
-                # instant when they go: a second Ctrl-C then killed the process.
-                quietly = SignalHandlerOptions.NO
-                rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
-                # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
-                # deleted.
-                executor = SingleThreadedExecutor()
-                nodes.extend(create())
+            # rclpy's own handlers end the context from another thread, and give way to the default action for an
+            # instant when they go: a second Ctrl-C then killed the process.
+            quietly = SignalHandlerOptions.NO
+            rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
+            # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
+            # deleted.
+            executor = SingleThreadedExecutor()
+            nodes.extend(create())
+            gc.freeze()
+            gc.enable()
             stop.starting = False
             code = _spin(nodes, executor, stop)
         except Exception as error:
@@ -116,6 +113,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
         # Around the handling of failures too.
         code = 0
     finally:
+        gc.enable()
         # A second Ctrl-C (launch sends one) must not interrupt the end.
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_IGN)
@@ -164,23 +162,7 @@ def share_heaps() -> None:
     Changes nothing without glibc.  For the start of a process: heaps that are there already stay.
     """
     with suppress(AttributeError):
-        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)
-
-
-@contextmanager
-def garbage_postponed() -> Iterator[None]:
-    """Postpone garbage collection within the block, and later exclude the objects that exist at its end.
-
-    For the start of a process: reference cycles among those objects are never freed.
-    """
-    was_enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()
-        if was_enabled:
-            gc.enable()
+        ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of malloc.h; with one heap threads wait for each other
 
 
 def keep_objects() -> None:
@@ -218,7 +200,7 @@ def _spin(nodes: Sequence[Any], executor: Executor, stop: _Stop) -> int:
     try:
         while rclpy.ok() and not stop.received:
             with suppress(InvalidHandle):  # ros2/rclpy issue 1284: an entity was destroyed by another thread
-                executor.spin_once(timeout_sec=_LOOK)
+                executor.spin_once(timeout_sec=0.1)
             failed = next((node for node in nodes if node.start_failure), None)
             if failed is not None:
                 _explain(failed.get_fully_qualified_name().lstrip("/"), failed.start_failure)

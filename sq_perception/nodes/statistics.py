@@ -22,15 +22,11 @@ OLDEST = 3600.0
 """Seconds; older messages, or ones from the future, come from a bag or another clock, and their age is ignored."""
 SECONDS = 10.0
 """Window of rates and latencies, seconds."""
-_MOST = 5000
-"""Number of events kept: more than any camera causes in that time."""
 WITHOUT_MASK = "without mask"
 """Frames that the node segmented although masks are published."""
 DOUBTED = "doubted"
 """Frames that seem to have another unit or kind."""
 _OUTCOMES = ("answered", "dropped", "refused")
-_SLOW = 3.0
-"""Seconds without an outcome that are too long even for a start."""
 Standing = tuple[bytes, str]
 """Level and message of a DiagnosticStatus."""
 
@@ -42,8 +38,8 @@ class Statistics:
         self._clock, self._started, self._what = clock, clock(), what
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
-        self._recent: deque[tuple[float, str]] = deque(maxlen=_MOST)
-        self._stages: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_MOST)
+        self._recent: deque[tuple[float, str]] = deque(maxlen=5000)
+        self._stages: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=5000)
         self._lost: Counter[str] = Counter()
         self._reported: tuple[Counter[str], Counter[str]] = Counter(), Counter()
         """Counts and lost messages at the last status."""
@@ -110,7 +106,7 @@ class Statistics:
             message = f"refused a {self._what}: {last_error.partition(' ')[2]}"
         elif counts[DOUBTED] > before[DOUBTED]:
             message = self._last_doubt
-        elif since > _SLOW and not recently["answered"]:
+        elif since > 3.0 and not recently["answered"]:
             message = f"{len(came)} {self._what}s came within {since:.0f} s, none was answered"
         elif new := lost - known:
             parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())

@@ -49,8 +49,7 @@ class SyntheticParameters(Parameters):
         "table",
         "thesis: orthographic grey images of one random body; table: a pinhole camera over bodies on a table; replay: "
         "recorded frames from path.",
-        choices=("thesis", "table", "replay"),
-        live=False,
+        choices=("thesis", "table", "replay"), live=False,
     )
     rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0))
     seed: int = setting(
@@ -59,8 +58,7 @@ class SyntheticParameters(Parameters):
     noise: float = setting(
         0.0,
         "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
-        unit="m or grey levels",
-        within=(0.0, 50.0),
+        unit="m or grey levels", within=(0.0, 50.0),
     )
     sensor: str = setting(
         IDEAL,
@@ -73,31 +71,25 @@ class SyntheticParameters(Parameters):
     loop: bool = setting(True, "Start again after the last scene or recording; false: stop publishing.", live=False)
     objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
     encoding: str = setting(
-        "auto",
-        "auto: mono8 for orthographic frames, 32FC1 for others.",
-        choices=("auto", *GREY_ENCODINGS, *DEPTH_ENCODINGS),
-        live=False,
+        "auto", "auto: mono8 for orthographic frames, 32FC1 for others.",
+        choices=("auto", *GREY_ENCODINGS, *DEPTH_ENCODINGS), live=False,
     )
     masks: str = setting(
         "auto",
         "Label images on mask/image: auto publishes those of recordings, always also those of generated scenes.",
-        choices=("auto", "always", "never"),
-        live=False,
+        choices=("auto", "always", "never"), live=False,
     )
     frame_id: str = setting(
         "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames.", live=False
     )
     path: str = setting("", "A recorded frame or a folder of them, for scene = replay.", live=False)
     camera_info_file: str = setting(
-        "",
-        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, without distortion.",
+        "", "camera_info YAML of recorded PNG depth images; also the camera of table scenes, without distortion.",
         live=False,
     )
     projection: Projection = setting(
-        "pinhole",
-        "Camera model of recorded images, since 8 bit orthographic images look like depth images.",
-        choices=get_args(Projection),
-        live=False,
+        "pinhole", "Camera model of recorded images, since 8 bit orthographic images look like depth images.",
+        choices=get_args(Projection), live=False,
     )
 
     def __post_init__(self) -> None:
@@ -163,11 +155,7 @@ class FrameSource:
 
 
 def generate(
-    scene: Literal["thesis", "table"],
-    seed: int,
-    *,
-    objects: int,
-    camera: Camera = TABLE_CAMERA,
+    scene: Literal["thesis", "table"], seed: int, *, objects: int, camera: Camera = TABLE_CAMERA,
     with_labels: bool = False,
 ) -> Maker:
     """Return a maker of random scenes: a thesis' image, or ``objects`` on a table before a ``camera``."""
@@ -185,9 +173,7 @@ def generate(
     return make
 
 
-def read(
-    paths: Sequence[Path], camera_info: Path | str | None, projection: Projection, *, with_labels: bool
-) -> Maker:
+def read(paths: Sequence[Path], camera_info: Path | str | None, projection: Projection, *, with_labels: bool) -> Maker:
     """Return a maker of recorded frames."""
 
     def make(position: int) -> SourceFrame:
@@ -221,9 +207,7 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
     else:
         count = parameters.scenes
         make = generate(
-            parameters.scene,
-            parameters.seed,
-            objects=parameters.objects,
+            parameters.scene, parameters.seed, objects=parameters.objects,
             camera=camera_file.read_calibration(info, "ignore").camera if info else TABLE_CAMERA,
             with_labels=parameters.masks == "always",
         )

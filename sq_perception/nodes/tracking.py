@@ -25,8 +25,6 @@ from sq_perception.tracking.session import Tally, TrackingSession
 Pose = tuple[np.ndarray, np.ndarray]
 """Quaternion x y z w (4,) and translation (3,), arrays where :data:`sq_perception.segmentation.options.Pose` has
 numbers."""
-_LEAST_LENGTH = 1e-6
-"""Least length of a quaternion that can be normalised."""
 
 
 class PoseError(ValueError):
@@ -77,7 +75,7 @@ class CameraPoses:
         turn, shift = found.transform.rotation, found.transform.translation
         quaternion, translation = np.array([turn.x, turn.y, turn.z, turn.w]), np.array([shift.x, shift.y, shift.z])
         length = np.linalg.norm(quaternion)
-        if not (np.isfinite(translation).all() and np.isfinite(length) and length > _LEAST_LENGTH):
+        if not (np.isfinite(translation).all() and np.isfinite(length) and length > 1e-6):
             raise PoseError(f"the transform from {header.frame_id} to {frame} is no rigid motion")
         return quaternion / length, translation
 
@@ -117,12 +115,7 @@ class Tracking:
         return self._session.tally
 
     def identify(
-        self,
-        recovery: FrameRecovery,
-        origin: Hashable,
-        frame: Frame,
-        arrival: float,
-        parameters: RecoverParameters,
+        self, recovery: FrameRecovery, origin: Hashable, frame: Frame, arrival: float, parameters: RecoverParameters
     ) -> Identified:
         """Return bodies with the ids of their tracks; without ``tracking`` ids are labels, and tracks are dropped.
 

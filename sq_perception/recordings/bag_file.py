@@ -23,7 +23,7 @@ is there.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from itertools import islice
@@ -44,10 +44,6 @@ from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFra
 SUFFIXES = (".mcap", ".db3")
 _MASKS, _RENDERED = "/mask/image", "/rendered_depth"
 """Ends of the topics of labels, and of what was recovered: the latter is read where nothing else shows depth."""
-_BAG_KEY, _HEAD = b"rosbag2_bagfile_information", 4096
-"""The key of a bag's metadata, and the bytes that it is looked for in."""
-_PEEKED = 10
-"""Messages of a topic after which it shows no depth: the first ones may be damaged."""
 
 
 def is_bag(path: str | Path) -> bool:
@@ -60,10 +56,10 @@ def is_bag(path: str | Path) -> bool:
         return False
     try:
         with about.open("rb") as file:  # data sets have files of this name, too
-            head = file.read(_HEAD)
+            head = file.read(4096)
     except OSError:
         return True  # and the reader says what is wrong
-    return not head or _BAG_KEY in head
+    return not head or b"rosbag2_bagfile_information" in head
 
 
 def frame_name(path: Path, stamp: Stamp) -> str:
@@ -110,9 +106,7 @@ class RecordedBag:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        options: InputOptions | None = None,
+        self, path: str | Path, options: InputOptions | None = None,
         is_done: Callable[[Stamp], bool] = lambda stamp: False,
     ) -> None:
         self._path = Path(path)
@@ -125,10 +119,12 @@ class RecordedBag:
             self._info_topic = bag_reader.info_topic(self._reader, self.topic, first, self._options.camera_info_topic)
             others = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
             self._mask_topics = sorted(topic for topic in others if topic.endswith(_MASKS))
-            self._masks = opened.enter_context(closing(self._recorded_masks()))
+            # In a reading of their own, as they come at any distance from their images, and do not fit into memory.
+            self._mask_reader = opened.enter_context(closing(BagReader(self._path)))
+            self._mask_times: dict[Stamp, int] = {}
             self._unread: FrameError | None = None
-            self._passed: dict[Stamp, int] = {}
-            """When masks were recorded that have been read so far: not all of them fit into memory."""
+            if len(self._mask_topics) == 1 and not self._options.reading.ignore_masks:
+                self._index_masks()
             self._opened = opened.pop_all()
 
     def __enter__(self) -> RecordedBag:
@@ -226,41 +222,40 @@ class RecordedBag:
         return None if message is None else str(message.content.encoding)
 
     def _first_images(self, topic: str) -> Iterator[Message]:
-        """Return the readable ones of the first images of a topic."""
-        found = islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED)
+        """Return the readable ones of the first images of a topic; some may be damaged."""
+        found = islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), 10)
         return (message for message in found if isinstance(message, Message))
 
     # frames
 
-    def _recorded_masks(self, received: int | None = None) -> Generator[Message | FrameError, None, None]:
-        """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
-        if len(self._mask_topics) != 1:
-            return
-        with closing(BagReader(self._path)) as reader:
-            yield from reader.messages(reader.connections(IMAGE, topic=self._mask_topics[0]), received=received)
+    def _recorded_masks(self, received: int | None = None) -> Iterator[Message | FrameError]:
+        connections = self._mask_reader.connections(IMAGE, topic=self._mask_topics[0])
+        return self._mask_reader.messages(connections, received=received)
 
-    def _mask(self, stamp: Stamp) -> Message | None:
-        """Return the first mask with this stamp, wherever it is: a segmentation may answer its images in another order.
-
-        None for an image without a stamp, as a node has it.  Raises ValueError where there is none, and one that cannot
-        be read might be it.
-        """
-        if stamp == Stamp(0, 0):
-            return None
-        if stamp not in self._passed:
-            for message in self._masks:
+    def _index_masks(self) -> None:
+        """Note when each mask was recorded: a segmentation may answer its images in another order."""
+        try:
+            for message in self._recorded_masks():
                 if isinstance(message, FrameError):
                     self._unread = self._unread or message
                     continue
-                self._passed.setdefault(message.stamp, message.received)
-                if message.stamp == stamp:
-                    return message
-            if self._unread is not None:
-                raise ValueError(f"it has no mask, or one that cannot be read: {self._unread}")
+                self._mask_times.setdefault(message.stamp, message.received)
+        except FrameError as error:
+            self._unread = error
+
+    def _mask(self, stamp: Stamp) -> Message | None:
+        """Return the first mask with this stamp; None without one, and for an image without a stamp, as a node has it.
+
+        Raises ValueError where there is none, and one that cannot be read might be it.
+        """
+        if stamp == Stamp(0, 0):
             return None
-        with closing(self._recorded_masks(self._passed[stamp])) as again:
-            found = (message for message in again if isinstance(message, Message) and message.stamp == stamp)
-            return next(found, None)
+        if stamp in self._mask_times:
+            found = self._recorded_masks(self._mask_times[stamp])
+            return next(one for one in found if isinstance(one, Message) and one.stamp == stamp)
+        if self._unread is not None:
+            raise ValueError(f"it has no mask, or one that cannot be read: {self._unread}")
+        return None
 
     def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
         """Return the masks of an image: from files if there is a folder of them, else from the bag."""
@@ -308,16 +303,9 @@ class RecordedBag:
             warnings.append(f"several topics with masks, none is taken: {', '.join(self._mask_topics)}")
         return reading.of(
             RecordedFrame(
-                depth,
-                camera,
-                labels,
-                name,
-                stamp=message.stamp,
-                topic=self.topic,
+                depth, camera, labels, name, stamp=message.stamp, topic=self.topic,
                 frame_id=message.content.header.frame_id,
-                warning="; ".join(f"{self._path}: {text}" for text in warnings),
-                notes="; ".join(notes),
-                encoding=encoding,
-                received=message.received,
+                warning="; ".join(f"{self._path}: {text}" for text in warnings), notes="; ".join(notes),
+                encoding=encoding, received=message.received,
             )
         )

@@ -30,10 +30,6 @@ from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.depth_units import Stated
 from sq_perception.recordings import camera_document
 
-_SKEW = 1e-6
-"""Skew as a share of fx; no depth camera in use has any."""
-_MOST_NODES = 10_000
-"""Mappings and lists of a document that are looked at; a scene of BOP has 3 for each of a thousand images."""
 CAMERA_FILES = (
     "camera_info.yaml",
     "camera_info.yml",
@@ -202,7 +198,11 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
     found = list(_cameras(document))
     whole = [one for one in found if _has_camera(one)]
     if not whole:
-        raise FrameError(_what_is_missing(found))
+        wanted = (_FX, _FY, _CX, _CY)
+        if has := max(([field for field in wanted if field in one.fields] for one in found), key=len, default=None):
+            missing = ", ".join(field for field in wanted if field not in has)
+            raise FrameError(f"expected {missing} (or other names for them) beside {', '.join(has)}")
+        raise FrameError("expected fx, fy, cx, cy, a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12")
     if isinstance(document, dict) and all(str(key).isdigit() for key in document):
         if name is None:
             whole = whole[:1]
@@ -225,7 +225,7 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
 
 def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None) -> Iterator[_Found]:
     """Return everything in a document that has a field of a camera."""
-    left = [_MOST_NODES] if left is None else left
+    left = [10_000] if left is None else left  # a scene of BOP has 3 for each of a thousand images
     left[0] -= 1
     if left[0] < 0:
         return
@@ -266,15 +266,6 @@ def _is_matrix(value: Any) -> bool:
     return isinstance(value, list | dict) and bool(value)
 
 
-def _what_is_missing(found: list[_Found]) -> str:
-    best = max(found, key=lambda one: len(one.fields.keys() & {_FX, _FY, _CX, _CY}), default=None)
-    has = [] if best is None else [name for name in (_FX, _FY, _CX, _CY) if name in best.fields]
-    if has:
-        missing = [name for name in (_FX, _FY, _CX, _CY) if name not in has]
-        return f"expected {', '.join(missing)} (or other names for them) beside {', '.join(has)}"
-    return "expected fx, fy, cx, cy, or a camera_matrix (K) of 9 numbers, or a projection_matrix (P) of 12"
-
-
 def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
     width, height = _sides(one, size) or (0, 0)
     if not width or not height:
@@ -294,14 +285,8 @@ def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
     if not isinstance(region, dict):
         raise FrameError(f"roi: expected a mapping, got {reprlib.repr(region)}")
     return CameraInfo(
-        width,
-        height,
-        lens,
-        tuple(coefficients.tolist()),
-        tuple(matrix.tolist()),
-        tuple(projection.tolist()),
-        _count(one.get("binning x"), "binning_x"),
-        _count(one.get("binning y"), "binning_y"),
+        width, height, lens, tuple(coefficients.tolist()), tuple(matrix.tolist()), tuple(projection.tolist()),
+        _count(one.get("binning x"), "binning_x"), _count(one.get("binning y"), "binning_y"),
         Region(*(_count(region.get(part), part) for part in ("x_offset", "y_offset", "width", "height"))),
         depth_units.parse_scale(float(unit), name) if is_unit else None,
     )
@@ -348,7 +333,7 @@ def _matrix(one: _Found) -> np.ndarray:
     if matrix[2, :2].any() and not matrix[:2, 2].any() and numbers.size != 12:  # column by column
         matrix = matrix.T
     matrix = matrix[:3, :3]
-    if abs(matrix[0, 1]) > _SKEW * abs(matrix[0, 0]):
+    if abs(matrix[0, 1]) > 1e-6 * abs(matrix[0, 0]):
         raise FrameError(f"{name}: expected no skew, got {matrix[0, 1]:g}")
     if matrix.any() and not np.allclose(matrix[2], [0, 0, 1]):
         raise FrameError(f"{name}: expected 0 0 1 in its last row, got {matrix[2].tolist()}")

@@ -114,22 +114,12 @@ class Reading:
     Raises ValueError for a scale or depth that is not positive, limits that leave nothing, an empty region, or another
     kind.
 
-    Attributes
-    ----------
-    scale : float or None
-        Units a metre; None: as a file states them, else 1000 for whole numbers and 1 for floats.
-    nearest, farthest : float
-        Readings beyond, metres, are none.
-    region : (4,) of int or None
-        Left column, top row, width and height of the part to look at, pixels of the rectified image.
-    masks : Path or None
-        A folder with the masks of each frame, by its name (:func:`sq_perception.files.unpacking.label_image`).
-    ignore_masks : bool
-        Whether no labels are read, wherever they are.
-    kind : str
-        "z", or "range" for images of distances to the camera's centre.
-    frame : CloudFrame or None
-        Where the camera is in the frame of clouds; None: in their origin, and looks along z.
+    ``scale`` float or None: units a metre; None: as a file states them, else 1000 for whole numbers and 1 for floats.
+    ``nearest``, ``farthest``: readings beyond, metres, are none.  ``region`` (4,) of int or None: left column, top row,
+    width and height of the part to look at, pixels of the rectified image.  ``masks`` Path or None: a folder with the
+    masks of each frame, by its name (:func:`sq_perception.files.unpacking.label_image`).  ``ignore_masks``: whether no
+    labels are read, wherever they are.  ``kind``: "z", or "range" for images of distances to the camera's centre.
+    ``frame`` CloudFrame or None: where the camera is in the frame of clouds; None: in their origin, and looks along z.
     """
 
     scale: float | None = None
@@ -198,11 +188,8 @@ class Reading:
 
 
 def read(
-    path: str | Path,
-    camera_info: str | Path | None = None,
-    projection: Projection = "pinhole",
-    distortion: Treatment = "auto",
-    reading: Reading | None = None,
+    path: str | Path, camera_info: str | Path | None = None, projection: Projection = "pinhole",
+    distortion: Treatment = "auto", reading: Reading | None = None,
 ) -> RecordedFrame:
     """Read one frame.
 
@@ -329,13 +316,7 @@ def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
         notes.append(cloud_file.LABELLED)
     warning = "" if found.is_image else cloud_file.UNORGANISED
     return RecordedFrame(
-        found.depth,
-        found.camera,
-        given,
-        path.name,
-        warning=warning,
-        notes="; ".join(notes),
-        encoding="32FC1",
+        found.depth, found.camera, given, path.name, warning=warning, notes="; ".join(notes), encoding="32FC1",
         has_free_space=found.is_image,
     )
 
@@ -371,7 +352,10 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     if projection == "orthographic" or is_cube:
         has_camera = "K" in fields and not is_cube
         warning = "orthographic was asked for, and a file has the matrix K of a pinhole camera" if has_camera else ""
-        return RecordedFrame(_single(depth), unit_cube.camera(width, height), labels, path.name, warning=warning)
+        with np.errstate(over="ignore"):  # some programs write the largest number that their type holds
+            single = depth.astype(np.float32)
+        single = np.where(np.isfinite(single), single, np.float32(np.nan))
+        return RecordedFrame(single, unit_cube.camera(width, height), labels, path.name, warning=warning)
     if "K" not in fields:
         raise ValueError("expected a field 'K', the 3 x 3 camera matrix")
     try:
@@ -384,10 +368,3 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
     return RecordedFrame(
         reading.z(found.depth, camera), camera, labels, path.name, notes="; ".join(found.notes), encoding="32FC1"
     )
-
-
-def _single(depth: np.ndarray) -> np.ndarray:
-    """Depth as float32, NaN where it is no reading: some programs write the largest number that their type holds."""
-    with np.errstate(over="ignore"):
-        found = depth.astype(np.float32)
-    return np.where(np.isfinite(found), found, np.float32(np.nan))

@@ -26,11 +26,6 @@ from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recordings.result_json import in_result_frame
 from sq_perception.recovery.recovery import FrameRecovery, edges_as_text, place_as_text
 
-_MOST_POINTS = 40000
-_SIGMAS = 2.0
-"""Standard deviations between a body and its shell."""
-_LARGEST_SHELL = 3.0
-"""Half sizes of a shell over those of its body, at most: one that is hardly known would hide the rest."""
 _TITLES = ("body", "status", "full edges", "centre", "exponents", "score", "why")
 _TEMPLATE = Path(__file__).with_name("html_page.html")
 
@@ -69,7 +64,7 @@ class HtmlPage:
 def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
     """Return what the page draws of a frame, and from where it looks at it."""
     camera, depth = frame.camera, frame.depth
-    stride = max(1, math.ceil(math.sqrt(depth.size / _MOST_POINTS)))
+    stride = max(1, math.ceil(math.sqrt(depth.size / 40000)))
     rows, columns = np.nonzero(np.isfinite(depth[::stride, ::stride]))
     rows, columns = stride * rows, stride * columns
     points = camera.unproject(columns, rows, depth[rows, columns]).astype(float)
@@ -108,7 +103,7 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
 def _body(number: int, body: Superquadric, sigma_size: np.ndarray, up: np.ndarray) -> dict[str, Any]:
     """The parameters of a body, the half sizes of its shell where they are known, and how far up its label stands."""
     sigma = np.nan_to_num(sigma_size, posinf=np.inf)
-    outer = np.minimum(body.size + _SIGMAS * sigma, _LARGEST_SHELL * body.size)
+    outer = np.minimum(body.size + 2 * sigma, 3 * body.size)  # a shell that is hardly known would hide the rest
     return {
         "number": number,
         **{name: np.asarray(getattr(body, name)).tolist() for name in ("size", "shape", "translation", "rotation")},

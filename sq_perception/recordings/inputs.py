@@ -6,6 +6,13 @@ subfolders, down to four levels, or of the one called depth.  The camera of its 
 by itself, is one of ``camera_file.CAMERA_FILES`` beside it or in the folder that was named, else the YAML of its own
 name.
 What cannot be read comes as an error with the reason, in its place, and the rest follows.
+
+Bodies get ids by a tracking session over each sequence, a topic of a bag or the frames of one folder, of a camera that
+stands still.  Frames without a stamp are taken to be INTERVAL apart.  With camera poses all frames show one scene that
+rests, whatever their cameras and stamps are.  Poses are read from a text file with a line a frame as in TUM RGB-D's
+trajectories, NAME tx ty tz qx qy qz qw.  NAME is the frame's file (with or without its folders and suffix), its topic,
+or its stamp in seconds, to the millisecond.  The pose leads from the frame's optical frame to a world that all share:
+p_world = R(q) p + t, metres.
 """
 
 from __future__ import annotations
@@ -16,10 +23,16 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from sq_perception.recordings import bag_file, camera_file, frame_file
 from sq_perception.recordings.bag_file import InputOptions, RecordedBag
 from sq_perception.recordings.camera_file import camera_beside, camera_in
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.tracking.session import Followed, TrackingSession
+from sq_perception.tracking.state import parse_pose
+from sq_perception.tracking.tracker import Track
 
 SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 
@@ -28,8 +41,6 @@ _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 _log = logging.getLogger(__name__)
 ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
-_LEVELS = 4
-"""Levels of folders below the one that was named: a benchmark's are set, scene and depth."""
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -42,9 +53,7 @@ class RecordedInput:
     """
 
     def __init__(
-        self,
-        names: Sequence[str],
-        options: InputOptions | None = None,
+        self, names: Sequence[str], options: InputOptions | None = None,
         is_done: Callable[[str, str, Stamp | None], bool] = lambda file, topic, stamp: False,
     ) -> None:
         self._options, self._is_done = options or InputOptions(), is_done
@@ -89,10 +98,10 @@ class RecordedInput:
         self._are_deeper = False
         found = self._in_folders(path, None)
         if self._are_deeper:
-            _log.warning("%s: folders in it are looked into for %d levels, and not farther down", path, _LEVELS)
+            _log.warning("%s: folders in it are looked into for 4 levels, and not farther down", path)
         return found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
 
-    def _in_folders(self, folder: Path, above: str | Path | None, levels: int = _LEVELS) -> list[_Source]:
+    def _in_folders(self, folder: Path, above: str | Path | None, levels: int = 4) -> list[_Source]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
         try:
             camera_info = self._options.camera_info or camera_in(folder) or above
@@ -144,3 +153,92 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
     """Return numbers in a name count as numbers: every second part is one."""
     parts = _DIGITS.split(path.name.lower())
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
+
+
+Pose = tuple[np.ndarray, np.ndarray]
+"""Quaternion x y z w (4,), translation (3,)."""
+
+
+class CameraPoses:
+    """The poses of a file.
+
+    Raises OSError if it cannot be read; ValueError if it is no such file; the message has the line.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._poses: dict[str, Pose] = {}
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1):
+            words = line.partition("#")[0].split()
+            if not words:
+                continue
+            try:
+                name, values = words[0], [float(word) for word in words[1:]]
+                pose = parse_pose((values[3:], values[:3]))
+            except ValueError as error:
+                expected = f"{path}: line {number}: expected a name, tx ty tz and a rotation qx qy qz qw, got {line!r}"
+                raise ValueError(expected) from error
+            if self._poses.setdefault(_key(name), pose) is not pose:
+                raise ValueError(f"{path}: line {number}: {name} has a pose already")
+
+    def of(self, file: str, frame: RecordedFrame) -> Pose:
+        """Return the pose of a frame of this source; a FrameError if the file has none."""
+        path = Path(file)
+        names = [file, path.name, path.stem, frame.topic]
+        names += [] if frame.stamp is None else [str(frame.stamp.sec + 1e-9 * frame.stamp.nanosec)]
+        for name in names:
+            if name and (pose := self._poses.get(_key(name))) is not None:
+                return pose
+        raise FrameError(f"{file}: {frame.name}: {self._path} has no pose for it")
+
+
+def _key(name: str) -> str:
+    """Return the name, of a number to the millisecond."""
+    try:
+        return f"{float(name):.3f}"
+    except ValueError:
+        return name
+
+
+INTERVAL = 0.1
+"""Seconds."""
+
+
+def sequence_of(file: str, frame: RecordedFrame) -> tuple[str, str]:
+    """A key that the frames of one sequence share: their bag and topic, or their folder; ``file`` is the source."""
+    return (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
+
+
+class RecordedTracks:
+    """Follows the bodies of one sequence after the other; ``warn`` is called once where stamps are missing."""
+
+    def __init__(self, warn: Callable[[str], None], poses: CameraPoses | None = None) -> None:
+        self._warn, self._poses = warn, poses
+        self._session = TrackingSession()
+        self._sequence: tuple[str, str] | None = None
+        self._number = 0
+        self._warned = False
+
+    def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> tuple[Followed, ...]:
+        """Return each body that did not fail, in their order, as its track knows it; ``file`` is the frame's source.
+
+        Raises FrameError for a frame without a pose, where there are poses.
+        """
+        if self._poses is not None:
+            pose = self._poses.of(file, frame)
+            return self._session.follow(recovery.recovered, 0.0, pose, camera=frame.camera, depth=frame.depth)
+        sequence = sequence_of(file, frame)
+        if sequence != self._sequence:
+            self._session.reset()
+            self._sequence, self._number = sequence, 0
+        stamp = self._number * INTERVAL if frame.stamp is None else frame.stamp.sec + 1e-9 * frame.stamp.nanosec
+        self._number += 1
+        if frame.stamp is None and not self._warned:
+            self._warn(f"{file}: no stamp; such frames are taken to be {INTERVAL:g} s apart")
+            self._warned = True
+        return self._session.follow(recovery.recovered, stamp, camera=frame.camera, depth=frame.depth)
+
+    @property
+    def scene(self) -> tuple[Track, ...]:
+        """The bodies of the whole scene in its world, with camera poses; empty without."""
+        return self._session.tracks if self._poses is not None else ()

@@ -41,8 +41,8 @@ CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
 """Frame ids of images that bring none."""
 
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
-_SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11), slice(5, 11)
-"""Parts of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
+_CENTRE = slice(5, 8)
+"""Of a body's covariance, beside its exponents at 3 and 4 and its rotation vector, in its own frame, from 8 to 10."""
 _OF_A_BODY = ("size", "shape", "translation", "rotation")
 """Columns of a message that are attributes of superquadrics of the same name."""
 _OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label", "objectness")
@@ -180,7 +180,7 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     """Return what a frame showed, in the frame of its image, whose header it is."""
     recovery = found.recovery
     array = superquadric_array(found, is_cube)
-    covariances = np.array([body.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN] for body in recovery.bodies])
+    covariances = np.array([body.covariance[5:, 5:] for body in recovery.bodies])
     change = np.zeros((len(array), 6, 6))
     change[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) if is_cube else np.eye(3)
     change[:, 3:, 3:] = poses.matrices(poses.unit_quaternions(array.rotation))
@@ -216,14 +216,10 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
     return SuperquadricArray(
-        **{name: getattr(bodies.untapered(), name) for name in _OF_A_BODY},
-        taper=bodies.taper,
-        id=np.array(found.ids),
+        **{name: getattr(bodies.untapered(), name) for name in _OF_A_BODY}, taper=bodies.taper, id=np.array(found.ids),
         **{name: np.array([getattr(body, name) for body in recovery.bodies]) for name in _OF_EACH_BODY},
-        **{name: np.array(values, np.uint32) for name, values in found.columns.items()},
-        sigma_shape=deviations[:, _SHAPE],
-        sigma_centre=np.sqrt(np.einsum("nii->ni", centres)),
-        sigma_turn=deviations[:, _TURN],
+        **{name: np.array(values, np.uint32) for name, values in found.columns.items()}, sigma_shape=deviations[:, 3:5],
+        sigma_centre=np.sqrt(np.einsum("nii->ni", centres)), sigma_turn=deviations[:, 8:],
     )
 
 
@@ -269,15 +265,9 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     """Return a batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
     count = len(bodies)
     return SuperquadricArray(
-        **{name: getattr(bodies, name) for name in _OF_A_BODY},
-        score=np.ones(count),
-        residual=np.zeros(count),
-        objectness=np.ones(count),
-        sigma_size=np.zeros((count, 3)),
-        sigma_shape=np.zeros((count, 2)),
-        sigma_centre=np.zeros((count, 3)),
-        sigma_turn=np.zeros((count, 3)),
-        id=np.arange(1, count + 1, dtype=np.uint32),
+        **{name: getattr(bodies, name) for name in _OF_A_BODY}, score=np.ones(count), residual=np.zeros(count),
+        objectness=np.ones(count), sigma_size=np.zeros((count, 3)), sigma_shape=np.zeros((count, 2)),
+        sigma_centre=np.zeros((count, 3)), sigma_turn=np.zeros((count, 3)), id=np.arange(1, count + 1, dtype=np.uint32),
         status=np.full(count, CONVERGED, dtype=np.uint32),
     )
 

@@ -42,8 +42,8 @@ from sq_perception.imaging.calibration import intrinsics
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_reader import camera_info_topic, raw_topic
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.inputs import INTERVAL
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, Findings, Identified
-from sq_perception.recordings.tracks import INTERVAL
 from sq_perception.recovery.recoverer import FrameRecovery, render_recovery
 from sq_perception.tracking.session import Followed
 
@@ -61,10 +61,6 @@ CHUNK_BYTES = 4 * 2**20
 """Bytes of messages in a chunk: enough to pack well, little to lose."""
 SUPERQUADRICS, MARKERS = "/recover_node/superquadrics", "/recover_node/markers"
 RENDERED, LABELS, DEPTH = "/recover_node/rendered_depth", "/mask/image", "/depth/image"
-LONGEST_NAME = 255
-"""Letters of a topic or frame id: a damaged recording's must not be copied into every marker."""
-
-_TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _SECOND = 10**9
 _STORE: Any = get_typestore(Stores.ROS2_JAZZY)
 
@@ -157,7 +153,10 @@ class ResultBag:
         header, messages = shown.header, []
         encoding = frame.encoding or ("mono16" if frame.is_cube else "32FC1")
         if "depth" in self._images:
-            topic = _depth_topic(frame.topic)
+            topic = raw_topic(frame.topic)
+            results = (SUPERQUADRICS, MARKERS, RENDERED, LABELS)
+            if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic) or len(topic) > 255 or topic in results:
+                topic = DEPTH
             if not frame.is_cube:
                 info = depth_image.intrinsics_to_message(intrinsics(frame.camera), header, types)
                 messages.append((camera_info_topic(topic), info))
@@ -176,8 +175,8 @@ class ResultBag:
 
     def _header(self, frame: RecordedFrame, stamp: Stamp) -> Any:
         frame_id = frame.frame_id if frame.topic else (CUBE_FRAME if frame.is_cube else CAMERA_FRAME)
-        if len(frame_id) > LONGEST_NAME:
-            raise FrameError(f"{frame.name}: frame_id: expected at most {LONGEST_NAME} letters, got {len(frame_id)}")
+        if len(frame_id) > 255:  # a damaged recording's must not be copied into every marker
+            raise FrameError(f"{frame.name}: frame_id: expected at most 255 letters, got {len(frame_id)}")
         time = types("builtin_interfaces/msg/Time")(sec=stamp.sec, nanosec=stamp.nanosec)
         return types("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
 
@@ -188,13 +187,6 @@ class ResultBag:
             return frame.stamp
         last = self._last.sec * _SECOND + self._last.nanosec
         return Stamp(*divmod(min(last + round(INTERVAL * _SECOND), latest * _SECOND), _SECOND))
-
-
-def _depth_topic(topic: str) -> str:
-    """Return the input's topic, unless it is none, or one of the results."""
-    topic = raw_topic(topic)
-    fits = _TOPIC.fullmatch(topic) is not None and len(topic) <= LONGEST_NAME
-    return topic if fits and topic not in (SUPERQUADRICS, MARKERS, RENDERED, LABELS) else DEPTH
 
 
 @cache

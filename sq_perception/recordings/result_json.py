@@ -20,8 +20,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sq_perception.files import output_file
-from sq_perception.files.version import __version__
+from sq_perception.files import __version__, output_file
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
@@ -227,8 +226,12 @@ class ResultLines:
         data = self._file.read()
         lines = data.split(b"\n")[:-1]
         entries = [self._entry(k, line) for k, line in enumerate(lines, 1)]
-        if len(entries) == 1 and _is_head(entries[0], expected):
-            lines = []  # of a run that came to no frame: it is begun again, with any options
+        # Of a run that came to no frame; a document in one line has frames too.
+        about = ("format", "version")
+        if len(entries) == 1 and entries[0].keys() == expected.keys() and all(
+            entries[0][name] == expected[name] for name in about
+        ):
+            lines = []  # it is begun again, with any options
         elif entries:
             self._compare(entries[0], expected)
         elif data.strip() and not _line(expected).startswith(data):
@@ -278,11 +281,6 @@ class Recovered:
         if found:
             self._left[key] -= 1
         return found
-
-
-def _is_head(found: Mapping[str, Any], expected: Mapping[str, Any]) -> bool:
-    """Return whether it is the first line of a file of lines, and no document, which has frames too."""
-    return found.keys() == expected.keys() and all(found[name] == expected[name] for name in ("format", "version"))
 
 
 def _refuse(constant: str) -> None:

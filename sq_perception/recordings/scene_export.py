@@ -34,8 +34,6 @@ from sq_perception.geometry.superquadric import Superquadric
 SUFFIXES = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml", "curobo": ".yml"}
 """Of the file of each format."""
 CAPSULE, MESH = "capsule", "mesh"
-_ANGLES = 1000
-"""Directions from the equator to the pole in which a capsule is made to enclose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,12 +101,7 @@ def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = Non
 
 
 def write(
-    bodies: Superquadric,
-    path: str | Path,
-    form: str,
-    *,
-    names: Sequence[str] | None = None,
-    frame: str = "world",
+    bodies: Superquadric, path: str | Path, form: str, *, names: Sequence[str] | None = None, frame: str = "world",
     meshes: bool = False,
 ) -> list[Path]:
     """Write n bodies (n,) as a scene; the files, those of meshes behind the scene's.  ValueError as :func:`solids`.
@@ -144,8 +137,8 @@ def write(
 def _capsule(size: np.ndarray, shape: np.ndarray) -> list[tuple[float, Primitive]]:
     """The capsule about a body's z axis with the radius of its cylinder, and its volume; none for a flat body."""
     (radius,) = (one.dimensions[1] for _, one in enclosing_solids(size, shape) if one.kind == CYLINDER)
-    angle = np.linspace(0.0, np.pi / 2, _ANGLES + 1)[1:]
-    normals = np.stack([np.cos(angle), np.zeros(_ANGLES), np.sin(angle)], axis=1)
+    angle = np.linspace(0.0, np.pi / 2, 1001)[1:]  # from the equator to the pole
+    normals = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)
     half = ((support(normals, np.array([radius, radius, size[2]]), shape) - radius) / normals[:, 2]).max()
     if half <= 0:
         return []

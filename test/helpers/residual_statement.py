@@ -19,11 +19,8 @@ def moved(body: Superquadric, step: torch.Tensor) -> Superquadric:
     """The body after a step (13,): d log a, d e, d t, a rotation vector in the object frame and d k."""
     turn = quaternions.from_rotation_vector(step[8:11])
     return Superquadric(
-        body.size * torch.exp(step[0:3]),
-        body.shape + step[3:5],
-        body.translation + step[5:8],
-        quaternions.multiply(body.rotation, turn),
-        body.taper + step[11:13],
+        body.size * torch.exp(step[0:3]), body.shape + step[3:5], body.translation + step[5:8],
+        quaternions.multiply(body.rotation, turn), body.taper + step[11:13],
     )
 
 

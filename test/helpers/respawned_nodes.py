@@ -49,13 +49,8 @@ class Viewer:
     def __init__(self, command: Sequence[str]) -> None:
         self.times: list[float] = []
         self._process = subprocess.Popen(
-            list(command),
-            env=environment(PYTHONUNBUFFERED="1"),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            start_new_session=True,
+            list(command), env=environment(PYTHONUNBUFFERED="1"), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL, text=True, start_new_session=True,
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
@@ -102,11 +97,7 @@ class Robot:
     """Three processes and the peer that watches them; leaves nothing behind."""
 
     def __init__(
-        self,
-        peer: Peer,
-        camera: Sequence[str] = (),
-        node: str = "recover_node",
-        parameters: Sequence[str] = (),
+        self, peer: Peer, camera: Sequence[str] = (), node: str = "recover_node", parameters: Sequence[str] = (),
     ) -> None:
         self._peer, self._node = peer, node
         self._camera, self._parameters = tuple(camera), tuple(parameters)

@@ -33,10 +33,8 @@ PATIENCE = 90.0
 """Seconds; a loaded machine compiles on the first start."""
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 BODIES = Superquadric(
-    np.array([[0.06, 0.05, 0.08], [0.04, 0.05, 0.06]]),
-    np.array([[0.4, 0.6], [0.2, 0.9]]),
-    np.array([[0.08, 0.01, 0.6], [-0.1, -0.02, 0.65]]),
-    np.array([[0.4, 0.3, 0.1, 0.85], [0.1, 0.5, 0.2, 0.8]]),
+    np.array([[0.06, 0.05, 0.08], [0.04, 0.05, 0.06]]), np.array([[0.4, 0.6], [0.2, 0.9]]),
+    np.array([[0.08, 0.01, 0.6], [-0.1, -0.02, 0.65]]), np.array([[0.4, 0.3, 0.1, 0.85], [0.1, 0.5, 0.2, 0.8]]),
 )
 """Two bodies in the optical frame, one to the right and one to the left."""
 
@@ -221,12 +219,7 @@ class Peer:
         return depth_to_message(_rendered(bodies, camera), header), intrinsics_to_message(known, header)
 
     def ask(
-        self,
-        node: str,
-        image: Image,
-        info: CameraInfo,
-        alive: Sequence[Child] = (),
-        space: str = "/",
+        self, node: str, image: Image, info: CameraInfo, alive: Sequence[Child] = (), space: str = "/",
         every: float = 1.0,
     ) -> Answer:
         """Publish a frame in a namespace, again ``every`` so often as best effort may lose it, until it is answered."""

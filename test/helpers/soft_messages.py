@@ -49,21 +49,9 @@ Detection3DArray = definition("Detection3DArray", header=Header, detections=list
 
 ObjectType = definition("ObjectType", key=str, db=str)
 CollisionObject = definition(
-    "CollisionObject",
-    {"ADD": b"\x00", "REMOVE": b"\x01", "APPEND": b"\x02", "MOVE": b"\x03"},
-    header=Header,
-    pose=Pose,
-    id=str,
-    type=ObjectType,
-    primitives=list,
-    primitive_poses=list,
-    meshes=list,
-    mesh_poses=list,
-    planes=list,
-    plane_poses=list,
-    subframe_names=list,
-    subframe_poses=list,
-    operation=lambda: b"\x00",
+    "CollisionObject", {"ADD": b"\x00", "REMOVE": b"\x01", "APPEND": b"\x02", "MOVE": b"\x03"}, header=Header,
+    pose=Pose, id=str, type=ObjectType, primitives=list, primitive_poses=list, meshes=list, mesh_poses=list,
+    planes=list, plane_poses=list, subframe_names=list, subframe_poses=list, operation=lambda: b"\x00",
 )
 RobotState = definition("RobotState", attached_collision_objects=list, is_diff=bool)
 PlanningSceneWorld = definition("PlanningSceneWorld", collision_objects=list)
@@ -73,24 +61,13 @@ GripperTranslation = definition(
     "GripperTranslation", direction=Vector3Stamped, desired_distance=float, min_distance=float
 )
 Grasp = definition(
-    "Grasp",
-    id=str,
-    pre_grasp_posture=JointTrajectory,
-    grasp_posture=JointTrajectory,
-    grasp_pose=PoseStamped,
-    grasp_quality=float,
-    pre_grasp_approach=GripperTranslation,
-    post_grasp_retreat=GripperTranslation,
-    post_place_retreat=GripperTranslation,
-    max_contact_force=float,
-    allowed_touch_objects=list,
+    "Grasp", id=str, pre_grasp_posture=JointTrajectory, grasp_posture=JointTrajectory, grasp_pose=PoseStamped,
+    grasp_quality=float, pre_grasp_approach=GripperTranslation, post_grasp_retreat=GripperTranslation,
+    post_place_retreat=GripperTranslation, max_contact_force=float, allowed_touch_objects=list,
 )
 MoveItErrorCodes = definition(
-    "MoveItErrorCodes",
-    {"SUCCESS": 1, "FAILURE": 99999, "PLANNING_FAILED": -1, "INVALID_OBJECT_NAME": -19},
-    val=int,
-    message=str,
-    source=str,
+    "MoveItErrorCodes", {"SUCCESS": 1, "FAILURE": 99999, "PLANNING_FAILED": -1, "INVALID_OBJECT_NAME": -19}, val=int,
+    message=str, source=str,
 )
 
 PACKAGES = {

@@ -35,10 +35,7 @@ class Child(subprocess.Popen[bytes]):
         super().__init__(
             command(node, arguments),
             env={**(os.environ if environment is None else environment), "PYTHONUNBUFFERED": "1"},
-            stdin=subprocess.DEVNULL,
-            stdout=self._output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
+            stdin=subprocess.DEVNULL, stdout=self._output, stderr=subprocess.STDOUT, start_new_session=True,
         )
 
     @property

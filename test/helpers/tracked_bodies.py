@@ -42,9 +42,7 @@ def nothing_but_the_covariances(patch, common, lasting):
 
 def body(size=(0.05, 0.04, 0.03), shape=(0.3, 0.5), centre=(0, 0, 0.8), turn=(0.1, 0.2, 0.3)):
     return Superquadric(
-        np.array(size, dtype=float),
-        np.array(shape, dtype=float),
-        np.array(centre, dtype=float),
+        np.array(size, dtype=float), np.array(shape, dtype=float), np.array(centre, dtype=float),
         quaternions.from_rotation_vector(np.array(turn, dtype=float)),
     )
 

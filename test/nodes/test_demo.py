@@ -32,26 +32,14 @@ def boxes(*centres: float) -> Superquadric:
     return Superquadric(size, np.full((count, 2), 0.3), translation, np.tile(IDENTITY, (count, 1)))
 
 
-def test_the_same_bodies_in_another_order_are_paired_with_full_overlap() -> None:
+def test_bodies_are_paired_by_their_overlap_whatever_their_order() -> None:
     truth = boxes(0.0, 0.3, 0.6)
     for body, (found, overlap) in zip(truth, match(truth, truth[np.array([2, 0, 1])]), strict=True):
         assert found is not None
         np.testing.assert_array_equal(found.to_flat(), body.to_flat())
         assert overlap == 1.0
-
-
-def test_what_overlaps_nothing_is_no_partner() -> None:
-    (first, _), (second, overlap) = match(boxes(0.0, 0.5), boxes(0.0, 5.0))
-    assert first is not None
-    assert (second, overlap) == (None, 0.0)
+    assert match(boxes(0.0, 0.5), boxes(0.0, 5.0))[1] == (None, 0.0), "what overlaps nothing is no partner"
     assert match(boxes(0.0), boxes()) == [(None, 0.0)]
-
-
-def test_two_blocks_that_overlap_by_half_have_an_iou_of_a_third() -> None:
-    block = Superquadric(np.full((1, 3), 0.1), np.full((1, 2), 0.02), np.zeros((1, 3)), IDENTITY[None])
-    moved = Superquadric(block.size, block.shape, np.array([[0.1, 0.0, 0.0]]), block.rotation)
-    ((_, overlap),) = match(block, moved)
-    assert overlap == pytest.approx(1 / 3, abs=0.03)
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
@@ -77,7 +65,6 @@ def test_it_shows_how_well_both_methods_do_and_draws_the_last_image(tmp_path: Pa
     assert network is not None, said
     assert int(network[1]) > 90
     assert float(network[2]) > 70
-    assert len(re.findall(r"^\d  \d+ x \d+ x \d+ ", said, re.MULTILINE)) == 5
     assert "demo.png" in said
     assert cv2.imread(str(tmp_path / "out" / "demo.png")).shape[1] > 1000
     assert (tmp_path / "out" / "demo.glb").read_bytes()[:4] == b"glTF"

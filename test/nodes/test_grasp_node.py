@@ -40,17 +40,11 @@ def bodies():
     size = np.array([[0.05, 0.02, 0.06], [0.033, 0.033, 0.06], [0.1, 0.1, 0.1]])
     count = len(size)
     return SuperquadricArray(
-        size=size,
-        shape=np.array([[0.1, 0.1], [0.1, 1.0], [0.1, 0.1]]),
+        size=size, shape=np.array([[0.1, 0.1], [0.1, 1.0], [0.1, 0.1]]),
         translation=np.array([[0.4, 0.0, 0.06], [0.6, 0.0, 0.06], [0.0, 0.5, 0.1]]),
-        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
-        score=np.ones(count),
-        residual=np.zeros(count),
-        sigma_size=np.full((count, 3), 0.001),
-        sigma_centre=np.full((count, 3), 0.001),
-        sigma_turn=np.full((count, 3), 0.01),
-        id=np.array([BOX, CAN, WALL]),
-        status=np.zeros(count, dtype=int),
+        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), score=np.ones(count), residual=np.zeros(count),
+        sigma_size=np.full((count, 3), 0.001), sigma_centre=np.full((count, 3), 0.001),
+        sigma_turn=np.full((count, 3), 0.01), id=np.array([BOX, CAN, WALL]), status=np.zeros(count, dtype=int),
     )
 
 
@@ -234,10 +228,8 @@ def test_what_is_too_wide_is_taken_by_a_part(bench):
     """A head as long as the wall, with a handle that points up; parts share its id."""
     both = np.array([2, 2])
     parts = replace(
-        bodies().where(both),
-        size=np.array([[0.1, 0.1, 0.05], [0.015, 0.015, 0.05]]),
-        translation=np.array([[0.0, 0.5, 0.05], [0.0, 0.5, 0.15]]),
-        part=np.array([1, 2]),
+        bodies().where(both), size=np.array([[0.1, 0.1, 0.05], [0.015, 0.015, 0.05]]),
+        translation=np.array([[0.0, 0.5, 0.05], [0.0, 0.5, 0.15]]), part=np.array([1, 2]),
     )
     assert WALL not in messages.from_message(bench.answer(to_message(bodies(), HEADER))["grasp_details"]).id
     found = messages.from_message(bench.answer(to_message(bodies().followed_by(parts), HEADER))["grasp_details"])

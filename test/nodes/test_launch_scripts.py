@@ -90,13 +90,8 @@ class Launch:
         environment.pop(process.PROFILE, None)
         path = str(self._repository / "launch_scripts" / "recover.launch.py")
         self._process = subprocess.Popen(
-            [sys.executable, "-c", SERVICE, path, *arguments],
-            cwd=self._folder,
-            env=environment,
-            stdout=(self._folder / "output").open("w"),
-            stderr=subprocess.STDOUT,
-            text=True,
-            start_new_session=True,
+            [sys.executable, "-c", SERVICE, path, *arguments], cwd=self._folder, env=environment,
+            stdout=(self._folder / "output").open("w"), stderr=subprocess.STDOUT, text=True, start_new_session=True,
         )
 
     @property

@@ -27,10 +27,7 @@ from sq_perception.recovery.recoverer import Recoverer
 
 FIELDS = ("encoding", "image size", "step", "data")
 QUICK = settings(
-    max_examples=500,
-    deadline=None,
-    derandomize=True,
-    database=None,
+    max_examples=500, deadline=None, derandomize=True, database=None,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.function_scoped_fixture],
 )
 

@@ -44,9 +44,7 @@ def make_node(context: Context) -> Iterator[Any]:
 
     def make(**overrides: Any) -> Node:
         node = Node(
-            f"parameters_{len(nodes)}",
-            context=context,
-            start_parameter_services=False,
+            f"parameters_{len(nodes)}", context=context, start_parameter_services=False,
             parameter_overrides=[Parameter(name, value=value) for name, value in overrides.items()],
         )
         nodes.append(node)

@@ -24,11 +24,7 @@ def built(source: Path, workspace: Path, *options: str) -> Path:
     environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     result = subprocess.run(
         [sys.executable, "-m", "colcon", "build", "--base-paths", "src", "--executor", "sequential", *options],
-        cwd=workspace,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=300,
+        cwd=workspace, env=environment, capture_output=True, text=True, timeout=300,
     )
     assert result.returncode == 0, result.stdout + result.stderr
     assert f"Finished <<< {PACKAGE}" in result.stdout
@@ -46,12 +42,8 @@ def sourced(install: Path, command: list[str], cwd: Path) -> subprocess.Complete
     environment = {**os.environ, "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
     script = '. "$0/local_setup.sh" && exec "$@"'
     return subprocess.run(
-        ["sh", "-c", script, str(install), *command],
-        cwd=cwd,
-        env={**environment, "COLCON_CURRENT_PREFIX": str(install)},
-        capture_output=True,
-        text=True,
-        timeout=120,
+        ["sh", "-c", script, str(install), *command], cwd=cwd,
+        env={**environment, "COLCON_CURRENT_PREFIX": str(install)}, capture_output=True, text=True, timeout=120,
     )
 
 

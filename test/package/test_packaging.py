@@ -118,12 +118,8 @@ def test_the_found_executable_starts_the_node(prefix: Path, node: str, tmp_path:
     bad = "friction:=-1.0" if node == "grasp_node" else "max_objects:=0"
     cameras = ["front", "wrist"] if node == "recover_cameras" else []
     result = subprocess.run(
-        [path, *cameras, "--ros-args", "-p", bad],
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": python_path},
-        capture_output=True,
-        text=True,
-        timeout=120,
+        [path, *cameras, "--ros-args", "-p", bad], cwd=tmp_path, env={**os.environ, "PYTHONPATH": python_path},
+        capture_output=True, text=True, timeout=120,
     )
     said = result.stdout + result.stderr
     assert result.returncode == 1, said

@@ -235,8 +235,7 @@ def test_the_likely_mistake_is_named(tmp_path, depth, fields, projection, said):
 
 
 @pytest.mark.parametrize(
-    ("name", "dtype"),
-    [("a.npz", np.float32), ("a.npz", np.float16), ("a.npy", np.float32), ("a.tiff", np.float32)],
+    ("name", "dtype"), [("a.npz", np.float32), ("a.npz", np.float16), ("a.npy", np.float32), ("a.tiff", np.float32)],
 )
 def test_a_scale_holds_for_floats_too(tmp_path, name, dtype):
     """Half floats are divided in full precision."""

@@ -50,8 +50,7 @@ def test_a_line_or_head_that_was_cut_short_is_written_again(path, end, done):
 
 
 @pytest.mark.parametrize(
-    "content",
-    ["important notes\n", "important notes", '{"format": "another"}\n', "[1]\n", "[" * 100_000 + "\n", "\n"],
+    "content", ["important notes\n", "important notes", '{"format": "another"}\n', "[1]\n", "[" * 100_000 + "\n", "\n"],
     ids=["text", "no line", "JSON", "list", "deep", "blank"],
 )
 def test_what_is_not_ours_is_refused_and_stays(tmp_path, content):

@@ -38,11 +38,8 @@ def three() -> SuperquadricArray:
         shape=np.array([[0.1, 0.1], [1.0, 1.0], [0.1, 1.0]]),
         translation=np.array([[1.0, 2.0, 3.0], [0.0, 0.0, 0.0], [-0.5, 0.25, 0.75]]),
         rotation=np.array([[0.0, 0.0, 0.6, 0.8], [0.0, 0.0, 0.0, 1.0], [0.0, 2.0, 0.0, 0.0]]),
-        score=np.array([0.75, 0.0, np.nan]),
-        residual=np.array([0.001, np.nan, 0.002]),
-        sigma_size=np.full((3, 3), 0.001),
-        id=np.array([4, 2**31 + 9, 6]),
-        status=np.array([CONVERGED, FAILED, WEAK]),
+        score=np.array([0.75, 0.0, np.nan]), residual=np.array([0.001, np.nan, 0.002]),
+        sigma_size=np.full((3, 3), 0.001), id=np.array([4, 2**31 + 9, 6]), status=np.array([CONVERGED, FAILED, WEAK]),
     )
 
 
