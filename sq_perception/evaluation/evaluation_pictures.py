@@ -16,16 +16,14 @@ from matplotlib.patches import Patch
 
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
-from sq_perception.evaluation.contest import Outcome
+from sq_perception.evaluation.contest import CAMERA, Outcome, ThesisImages
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
-from sq_perception.evaluation.thesis_images import CAMERA, ThesisImages
 from sq_perception.geometry.mesh import outline
 from sq_perception.imaging import raycast, unit_cube
 
 _BAR = "#7f97aa"
 _GRID = "#dfe5ea"
 _EACH = 3
-_ARC_BINS = np.linspace(0, 360, 121)
 _BINS = np.linspace(0, 100, 101)
 """Edges of bins for IoU in per cent and for angles in degrees."""
 _CLOSE_IOU_BINS = np.linspace(95, 100, 101)
@@ -46,7 +44,7 @@ def distributions(outcome: Outcome) -> Figure:
     ax.set_ylabel("bodies", fontsize=9, color=plots.INK)
     plots.heading_of(ax, "IoU", f"{100 * summary['over_85']:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
 
-    ax = _histogram(figure.add_subplot(grid[1]), np.rad2deg(figures.shortest_arc), _ARC_BINS, "radians")
+    ax = _histogram(figure.add_subplot(grid[1]), np.rad2deg(figures.shortest_arc), np.linspace(0, 360, 121), "radians")
     ax.set_xticks(np.arange(0, 361, 90), ["0", "π/2", "π", "3π/2", "2π"])
     turned = f"{100 * summary['quarter_turns']:.0f} % quarter turns"
     plots.heading_of(ax, "Arc to the label (figure 6.3)", turned)

@@ -39,7 +39,6 @@ WIRE = "#d1006c"
 NOTHING = "#1b2129"
 FAINT = "#8a97a3"
 DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#8b9dab", "#566a7b", "#36475a"])
-_CONTOUR_PIXELS = 1280
 Window = tuple[float, float, float, float]
 """Left, right, top, bottom of a part of an image."""
 
@@ -150,7 +149,7 @@ def draw_grasps(
 
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:
     """Closed outlines (n, 2) of a body in the image, in pixels; cut at the image's border, empty if out of sight."""
-    k = max(1, _CONTOUR_PIXELS // max(camera.width, camera.height))
+    k = max(1, 1280 // max(camera.width, camera.height))
     cx, cy = (camera.cx + 0.5) * k - 0.5, (camera.cy + 0.5) * k - 0.5
     fine = Camera(camera.width * k, camera.height * k, camera.fx * k, camera.fy * k, cx, cy, camera.projection)
     _, index = raycast.render(body, fine)

@@ -26,19 +26,12 @@ _MOST_LISTED = 8
 
 
 def demo_figure(
-    depth: np.ndarray,
-    camera: Camera,
-    truth: Sequence[Superquadric],
-    methods: Mapping[str, Sequence[Superquadric]],
+    depth: np.ndarray, camera: Camera, truth: Sequence[Superquadric], methods: Mapping[str, Sequence[Superquadric]]
 ) -> Figure:
     """Draw a column for the image and its true bodies, and one a method: outlines above, bodies in space below.
 
-    Parameters
-    ----------
-    depth : (height, width)
-        Metres, NaN for no reading.
-    truth, methods
-        Single bodies in the optical frame, those of the methods by title.
+    depth: (height, width), metres, NaN for no reading.
+    truth, methods: Single bodies in the optical frame, those of the methods by title.
     """
     columns = {"true bodies": truth, **methods}
     figure = plots.new_figure(5.0 * len(columns), 8.6)

@@ -47,27 +47,17 @@ depth pictures, to normal, deuteranopic and protanopic eyes (Machado et al. 2009
 FORMATS = ("glb", "ply", "stl", "obj", "dae")
 """Suffixes of the files that :func:`export` writes."""
 
-HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turn between the optical frame, y down, and that of viewers of meshes, y up."""
-_SAME_POINT_DIGITS = 12
 
 
 def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:
     """Return the closed triangle mesh of one body as arrays.
 
-    Parameters
-    ----------
-    body : Superquadric
-        A single NumPy body.
-    resolution : int
-        Points around and rows from pole to pole; a multiple of 8, so that the corners of a box are among the points.
+    body: A single NumPy body.
+    resolution: Points around and rows from pole to pole; a multiple of 8, so that the corners of a box are among the
+        points.
 
-    Returns
-    -------
-    vertices : (n, 3)
-        On the surface, in the body's parent frame.
-    faces : (m, 3)
-        Indices of vertices; watertight, faces outwards; convex without a taper.
+    vertices: (n, 3), on the surface, in the body's parent frame.
+    faces: (m, 3), indices of vertices; watertight, faces outwards; convex without a taper.
     """
     from scipy.spatial import ConvexHull  # here: a node that recovers does without
 
@@ -81,7 +71,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
     )
     unit = Superquadric.at_origin(np.ones(3), body.shape)
     points = unit.parametric_points(eta.ravel(), omega.ravel())
-    _, kept = np.unique(np.round(points, _SAME_POINT_DIGITS), axis=0, return_index=True)
+    _, kept = np.unique(np.round(points, 12), axis=0, return_index=True)
     points = points[np.sort(kept)]
     hull = ConvexHull(points, qhull_options="QbB Pp Qt")
     used = np.full(len(points), -1)
@@ -181,7 +171,8 @@ def export(
         return path
     if optical and suffix != ".obj":
         for part in meshes:
-            part.apply_transform(HALF_TURN_ABOUT_X)
+            # Turn between the optical frame, y down, and that of viewers of meshes, y up.
+            part.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
     if suffix == ".dae":
         shades = [palette[k % len(palette)] for k in range(len(meshes))]
         path.write_bytes(_collada(list(zip(names, meshes, shades, strict=True))))

@@ -44,7 +44,7 @@ import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, checked_turn, floating, one_body
+from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, check_turn, floating, one_body
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -112,7 +112,7 @@ class Superquadric:
         if tensors[0]:
             self.__dict__["taper"] = taper
             return
-        parts[3] = checked_turn(parts)
+        parts[3] = check_turn(parts)
         batch = np.broadcast_shapes(*{part.shape[:-1] for part in parts})
         for (name, length), part in zip(LENGTHS.items(), parts, strict=True):
             shown = part.view() if part.shape[:-1] == batch else np.broadcast_to(part, (*batch, length))
@@ -442,15 +442,10 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
     norm of (a1 f1 n_x, a2 f2 n_y).  Along the profile, t = +-sin^e1(w) and sigma = cos^e1(w), octahedra have several
     maxima: the best of some points is followed by golden sections.
 
-    Parameters
-    ----------
-    q : (..., N, 3)
-        a |n|, n the direction in the object's frame.
-    along : (..., N)
-        n_z a3.
-    conjugate : (..., 1, 2)
-        2 - e.
-    taper : (..., 1, 2)
+    q: (..., N, 3), a |n|, n the direction in the object's frame.
+    along: (..., N), n_z a3.
+    conjugate: (..., 1, 2), 2 - e.
+    taper: (..., 1, 2).
     """
     xp = array_namespace(q)
     e1, e2 = 2 - conjugate[..., 0], conjugate[..., 1]

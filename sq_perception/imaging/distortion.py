@@ -39,25 +39,17 @@ MODELS = (*POLYNOMIAL, FISHEYE)
 _LENGTHS = {**dict.fromkeys(POLYNOMIAL, (4, 5, 8, 12, 14)), FISHEYE: (4,)}
 _LARGEST = 1e6
 """The largest coefficient; whatever is larger is no lens."""
-_WIDEST = math.pi / 2 - 1e-3
 _SAMPLES = 4096
-_STEPS = 20
 _EXACT = 1e-13
 """Tolerance of the place of an image: a ten-thousandth of a millionth of a pixel."""
-_NEAR_AXIS = 1e-6
-"""s below which the fisheye's q is its series."""
 
 
 @dataclass(frozen=True)
 class Distortion:
     """One lens; see the module for the equations.
 
-    Parameters
-    ----------
-    model
-        One of ``MODELS``.
-    coefficients
-        In OpenCV's order.  As for OpenCV, their number determines the terms, for plumb_bob and
+    model: One of ``MODELS``.
+    coefficients: In OpenCV's order.  As for OpenCV, their number determines the terms, for plumb_bob and
         rational_polynomial alike: 4, 5, 8, or 12 and 14 where thin prism and tilt are zero.
 
     Raises ValueError for another model, another number of coefficients, a coefficient that is not finite or absurdly
@@ -106,7 +98,7 @@ class Distortion:
             radius = np.hypot(flat[:, 0], flat[:, 1])
             start = np.where(radius > 0, np.interp(radius, reached, table) / radius, 1.0)
             x, y = flat[:, 0] * start, flat[:, 1] * start
-            for _ in range(_STEPS):
+            for _ in range(20):
                 image_x, image_y, (xx, xy, yy) = self._map(x, y)
                 miss_x, miss_y = flat[:, 0] - image_x, flat[:, 1] - image_y
                 # Relative: the farther out, the larger the numbers.
@@ -148,7 +140,8 @@ class Distortion:
         t = theta * theta
         turned = theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
         rate = (1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + 9 * k4 * t)))) / (1 + s)
-        near = s < _NEAR_AXIS
+        # s below which the fisheye's q is its series.
+        near = s < 1e-6
         safe = np.where(near, 1.0, r)
         q = np.where(near, 1 + (k1 - 1 / 3) * s, turned / safe)
         return q, np.where(near, k1 - 1 / 3, (rate - q) / (2 * safe * safe))
@@ -156,7 +149,7 @@ class Distortion:
     @cached_property
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
         """Radii r of rays and r' of their images, tangential part left out, both rising, up to where r' turns back."""
-        radius = np.tan(np.linspace(0.0, _WIDEST, _SAMPLES))
+        radius = np.tan(np.linspace(0.0, (math.pi / 2 - 1e-3), _SAMPLES))
         with np.errstate(all="ignore"):
             reached = radius * self._radial(radius * radius)[0]
             back = np.flatnonzero(~(np.diff(reached) > 0))

@@ -21,8 +21,8 @@ import numpy as np
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.geometry.threads import one_torch_thread
+from sq_perception.geometry.union import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH

@@ -24,7 +24,7 @@ The network of things
 ---------------------
 View and support plane in, support function of the thing's hull out.  h(n) = max over the thing of n.(p - c) is what
 boxes, widths, resting and grasps are made of; it exists for every shape and asks for no order of axes.  For the J
-directions n_j of :data:`sq_perception.geometry.support_directions.DIRECTIONS` the network predicts h ~ t_nu(mu, S), a
+directions n_j of :data:`sq_perception.geometry.union.DIRECTIONS` the network predicts h ~ t_nu(mu, S), a
 multivariate t distribution with
 
     S = diag(sigma^2) + L L^T,    L (J, K),
@@ -69,7 +69,7 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning.layout import BLOCK, CELLS_AT_ONCE, TORCHVISION_BLOCK

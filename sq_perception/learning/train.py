@@ -38,8 +38,6 @@ _CALIBRATION = 2048
 """Views from which normalisations are measured anew."""
 _BATCH = 250
 """Views of a validation that are computed at once."""
-_HIDDEN = 0.3
-"""Share of each body that is hidden in the validation set ``hidden``."""
 
 
 def train(
@@ -50,16 +48,10 @@ def train(
 ) -> Regressor:
     """Run, or continue, a training; returns the averaged network, also saved in ``output``.
 
-    Parameters
-    ----------
-    config
-        The run.
-    output
-        The folder of the run.
-    network
-        A form other than that of ``config``.
-    advance
-        Called with the steps done and the loss of the last one.
+    config: The run.
+    output: The folder of the run.
+    network: A form other than that of ``config``.
+    advance: Called with the steps done and the loss of the last one.
 
     Raises ArithmeticError or Stopped as :func:`sq_perception.learning.training.run`; CheckpointError if a file to begin
     or to go on with does not fit; ValueError for a device that this machine does not have, or data or a network to
@@ -177,7 +169,8 @@ def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[s
         sets["iou_worn"] = Disturbance(noisy_share=1.0).apply(near, rng), bodies
     if config.occluded_share > 0:
         rng = np.random.default_rng(seed)
-        occluder = any_occluder(np.full(count, _HIDDEN), rng)
+        # Share of each body that is hidden in the validation set ``hidden``.
+        occluder = any_occluder(np.full(count, 0.3), rng)
         sets["iou_hidden"] = draw_views(count, rng, ViewSource(pixels, config.pinhole_share), occluder)
     if config.canonical_labels:  # what is given to the network counts as it was given in training
         return {name: (views, bodies.canonical_form()) for name, (views, bodies) in sets.items()}

@@ -34,8 +34,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "schedule": ("cosine", "plateau"),
 }
 """Fields that name something, and the names there are."""
-_SEEDS = 2**63
-"""Seeds are below it, as torch takes them."""
 
 
 def _setting(default: Any, meaning: str) -> Any:
@@ -157,7 +155,8 @@ class TrainingConfig(Run):
         for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
-        if self.seed >= _SEEDS:
+        # Seeds are below it, as torch takes them.
+        if self.seed >= 2**63:
             raise ValueError(f"seed: expected a number below 2^63, got {self.seed}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate: expected a positive number, got {self.learning_rate}")

@@ -101,12 +101,7 @@ def one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
     return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
 
 
-def part(
-    size: Numbers,
-    shape: Numbers,
-    at: Numbers = (0.0, 0.0, 0.0),
-    turn: Numbers = (0.0, 0.0, 0.0, 1.0),
-) -> Row:
+def part(size: Numbers, shape: Numbers, at: Numbers = (0.0, 0.0, 0.0), turn: Numbers = (0.0, 0.0, 0.0, 1.0)) -> Row:
     """Return a superquadric of half sizes, exponents, centre, quaternion."""
     return (*size, *shape, *at, *turn)
 

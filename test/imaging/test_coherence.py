@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sq_perception.imaging.coherence import coherent
+from sq_perception.imaging.depth_steps import coherent
 
 JUMP = 0.02
 

@@ -12,7 +12,7 @@ from unit_axis import cell_centres, grid, soft_images
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
-from sq_perception.imaging import sight_lines
+from sq_perception.imaging import soft_render
 from sq_perception.learning import losses
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 from sq_perception.learning.losses import Objective
@@ -169,7 +169,7 @@ class TestRenderLoss:
         images, bodies = render_views(thesis_bodies(4, np.random.default_rng(4)), 48)
         view = torch.tensor(images).double()
         guess = tensors(Superquadric(bodies.size * 1.2, bodies.shape, bodies.translation, bodies.rotation))
-        lines, depth = sight_lines.of_view(view)
+        lines, depth = soft_render.of_view(view)
         voxels = voxel_loss(guess, view, 20.0, 40 / 48)
         limit = losses.render_loss(guess, lines, depth, 20.0, 40.0)
         torch.testing.assert_close(voxels, limit, rtol=0.05, atol=0)

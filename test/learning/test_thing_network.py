@@ -16,7 +16,7 @@ from scipy.stats import multivariate_t
 from sq_perception.commands import main
 from sq_perception.geometry.rotation import random
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
+from sq_perception.geometry.union import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, networks, shard_training
 from sq_perception.learning.inference import ThingPredictor

@@ -40,7 +40,7 @@ def test_a_crowd_seen_by_a_stereo_camera_is_parted(seed):
     rng = np.random.default_rng(seed)
     scene = scenes.draw_crowd(rng, 6)
     depth, truth = scene.render()
-    found = segment(sensor_noise.preset("realsense_d435").measured(depth, scene.camera, rng), scene.camera)
+    found = segment(sensor_noise.preset("realsense_d435").measure(depth, scene.camera, rng), scene.camera)
     visible = [k for k in set(np.unique(truth)) - {0} if np.sum(truth == k) > 1500]
     assert len(visible) - 1 <= len(found.ids) <= 6
     good = [

@@ -7,8 +7,7 @@ import pytest
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
-from sq_perception.geometry.union import support_of_union
+from sq_perception.geometry.union import DIRECTIONS, mirrored, support_of_union
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import COVERED, FLUSH, HIDDEN, NEAREST
@@ -271,7 +270,7 @@ def test_a_shadow_lies_on_one_side() -> None:
         if not baseline or setting.table is None or len(setting.others):
             continue
         depth, mask = setting.render()
-        lost = np.isnan(sensor.measured(depth, setting.camera, rng)) & ~mask
+        lost = np.isnan(sensor.measure(depth, setting.camera, rng)) & ~mask
         # A stereo sensor's own border band is beyond this: between the thing's columns and ten pixels more.
         rows, columns = np.nonzero(mask)
         left, right = columns.min(), columns.max()

@@ -28,7 +28,7 @@ def test_axes_keep_their_names_in_a_still_scene(recoverer, seed, has_masks):
     sessions = {"tracked": TrackingSession(), "by themselves": TrackingSession()}
     last, own_turns = {}, 0
     for k in range(FRAMES):
-        image = noise.measured(depth, scene.camera, rng)
+        image = noise.measure(depth, scene.camera, rng)
         seen = recoverer.recover(image, scene.camera, labels if has_masks else None).recovered
         for name, session in sessions.items():
             is_pose_known = name == "tracked" or k == 0
