@@ -167,8 +167,6 @@ class Objective:
     sharpness_start: float = 0.0
     sharpness_end: float = 0.0
     """s at the start and the end of the run; 0 takes the values of the table."""
-    tau: float = 0.0
-    """n tau / s of the render loss; 0 takes its own value."""
     framing: str = "cropped"
     """Framing of the views."""
     stride: int = 2
@@ -213,7 +211,7 @@ class Objective:
         lines, depth = soft_render.of_view(views[:, 0], self.stride, row, column, self.framing)
         if self.name == "render":
             # D of the soft depth, in units of s.
-            return render_loss(prediction, lines, depth, s, (self.tau or 2.0) * s)
+            return render_loss(prediction, lines, depth, s, 2.0 * s)
         smallness = max(0.0, 1 - progress / 0.8)
         loss = least_squares_loss(prediction, lines, depth)
         loss = loss * (prediction.size.prod(dim=-1) / 0.05) ** smallness

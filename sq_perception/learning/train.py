@@ -77,9 +77,7 @@ def train(
 
 def _course(config: TrainingConfig, state: TrainingState, device: torch.device) -> Course:
     form = state.model.config
-    objective = Objective(
-        config.loss, config.points, config.sharpness_start, config.sharpness_end, config.tau, config.framing
-    )
+    objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end, config.framing)
     seed = np.random.SeedSequence([config.seed, state.step])
     generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
     disturbance = Disturbance(config.occluded_share, config.noisy_share)

@@ -144,20 +144,6 @@ class TestLeastSquares:
         assert losses.free_space_loss(wide, lines, depth).item() > 0.01
 
 
-class TestTau:
-    def test_a_training_takes_its_own_unless_another_is_given(self) -> None:
-        """7.10: D = n tau, in units of s."""
-        guess = tensors(thesis_bodies(2, np.random.default_rng(5)))
-        view = torch.zeros(2, 1, 16, 16, dtype=DOUBLE)
-
-        def loss(**given: float) -> torch.Tensor:
-            objective = Objective("render", sharpness_start=20.0, sharpness_end=20.0, **given)
-            return objective.loss(guess, view, None, 0.0, torch.Generator().manual_seed(1))
-
-        torch.testing.assert_close(loss(), loss(tau=2.0))
-        assert not torch.allclose(loss(), loss(tau=0.5))
-
-
 class TestRenderLoss:
     def test_hand_computed(self) -> None:
         """A body that no line meets renders to 0, and the loss is the mean of the image."""
