@@ -95,12 +95,17 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels_in: int, channels_out: int, stride: int, names: Sequence[str] = BLOCK) -> None:
         super().__init__()
+        shortcut: nn.Module = nn.Identity()
+        if stride > 1 or channels_in != channels_out:
+            shortcut = nn.Sequential(
+                nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), nn.BatchNorm2d(channels_out)
+            )
         modules = (
             nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False),
             nn.BatchNorm2d(channels_out),
             nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False),
             nn.BatchNorm2d(channels_out),
-            _shortcut(channels_in, channels_out, stride),
+            shortcut,
         )
         for name, module in zip(names, modules, strict=True):
             self.add_module(name, module)
@@ -163,12 +168,6 @@ def _stage(
     """Residual blocks one after the other, of which the first may halve the resolution."""
     first: list[nn.Module] = [ResidualBlock(channels_in, channels_out, stride, names)]
     return first + [ResidualBlock(channels_out, channels_out, 1, names) for _ in range(blocks - 1)]
-
-
-def _shortcut(channels_in: int, channels_out: int, stride: int) -> nn.Module:
-    if stride == 1 and channels_in == channels_out:
-        return nn.Identity()
-    return nn.Sequential(nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), nn.BatchNorm2d(channels_out))
 
 
 class Regressor(nn.Module):
