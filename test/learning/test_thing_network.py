@@ -147,6 +147,8 @@ def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
         checkpoint.load(path)
     with pytest.raises(checkpoint.CheckpointError, match="expected a header"):
         checkpoint.load_things("robust")
+    with pytest.raises(checkpoint.CheckpointError, match=r"sq_perception\.masks"):
+        checkpoint.load_masks("robust")
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -257,13 +257,6 @@ def test_another_body_elsewhere_is_another_one(rng):
     assert [t.observation for t in tracks] == [None, 0]
 
 
-def test_a_stamp_that_jumps_back_resets_and_ids_go_on(rng):
-    tracker = Tracker()
-    tracker.update([draw(body(), noise(), rng)], 10.0)
-    (track,) = tracker.update([draw(body(), noise(), rng)], 9.0)
-    assert (track.id, track.seen) == (2, 1)
-
-
 def test_a_long_gap_forgets_the_pose_and_keeps_the_sizes(rng):
     truth, tracker = body(), Tracker()
     for k in range(5):
