@@ -45,9 +45,6 @@ CAMERA = unit_cube.camera()
 """The orthographic camera of all images."""
 CHUNK = 200
 """Images in memory at a time, 50 MB; changes no result."""
-_BLOCK = 500
-_NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
-"""Placeholder where nothing was recovered, outside of the cube."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +61,11 @@ class ThesisImages:
     @cached_property
     def truth(self) -> Superquadric:
         """All bodies (count,) in the cube frame."""
+        block_size = 500
         blocks = []
-        for block in range(-(-self.count // _BLOCK)):
+        for block in range(-(-self.count // block_size)):
             seeds = np.random.SeedSequence(self.seed, spawn_key=(6, block))
-            blocks.append(thesis_bodies(_BLOCK, np.random.default_rng(seeds)).to_flat())
+            blocks.append(thesis_bodies(block_size, np.random.default_rng(seeds)).to_flat())
         return Superquadric.from_flat(np.concatenate(blocks)[: self.count])
 
     def image(self, number: int) -> np.ndarray:
@@ -225,7 +223,9 @@ def compare(
         flat, milliseconds = (np.concatenate(parts) for parts in zip(*mine, strict=True))
         recovered = np.isfinite(flat).all(axis=1)
         labels = contestant.labels(images.truth[:count])
-        bodies = Superquadric.from_flat(np.where(recovered[:, None], flat, _NOBODY))
+        # Placeholder where nothing was recovered, outside of the cube.
+        nobody = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
+        bodies = Superquadric.from_flat(np.where(recovered[:, None], flat, nobody))
         bodies = contestant.with_given(bodies, labels)
         outcomes.append(Outcome(contestant, FiguresOfMerit.of(bodies, labels, recovered, milliseconds), bodies, labels))
     return outcomes

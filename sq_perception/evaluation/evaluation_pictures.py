@@ -24,19 +24,17 @@ from sq_perception.imaging import raycast, unit_cube
 _BAR = "#7f97aa"
 _GRID = "#dfe5ea"
 _EACH = 3
-_BINS = np.linspace(0, 100, 101)
-"""Edges of bins for IoU in per cent and for angles in degrees."""
-_CLOSE_IOU_BINS = np.linspace(95, 100, 101)
-"""Where every body is this good."""
 
 
 def distributions(outcome: Outcome) -> Figure:
     """IoU (as figures 6.6, 7.3, 7.7), shortest arc (figure 6.3) and the angle that is a property of the bodies."""
+    bins_of_100 = np.linspace(0, 100, 101)  # edges of bins for IoU in per cent and for angles in degrees
+    close = np.linspace(95, 100, 101)  # where every body is this good
     figure = plots.new_figure(14.0, 3.5)
     grid = figure.add_gridspec(1, 3, left=0.045, right=0.985, bottom=0.15, top=0.88, wspace=0.17)
     figures, summary = outcome.figures, outcome.figures.summary()
 
-    bins = _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _BINS
+    bins = close if summary["iou_min"] > 0.01 * close[0] else bins_of_100
     ax = _histogram(figure.add_subplot(grid[0]), 100 * figures.iou, bins, "IoU, per cent")
     ax.axvline(100 * summary["iou_mean"], color=plots.WIRE, lw=1.2)
     low, high = (100 * (summary["iou_mean"] + side * summary["iou_std"]) for side in (-1, 1))
@@ -49,9 +47,9 @@ def distributions(outcome: Outcome) -> Figure:
     turned = f"{100 * summary['quarter_turns']:.0f} % quarter turns"
     plots.heading_of(ax, "Arc to the label (figure 6.3)", turned)
 
-    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), _BINS, "degrees")
+    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), bins_of_100, "degrees")
     free = np.rad2deg(figures.any_order_angle)
-    ax.hist(free[np.isfinite(free)], bins=_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
+    ax.hist(free[np.isfinite(free)], bins=bins_of_100.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
     if summary["recovered"]:
         medians = np.rad2deg([summary["symmetric_angle_median"], summary["any_order_angle_median"]])
         names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")

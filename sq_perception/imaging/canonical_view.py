@@ -50,8 +50,6 @@ OUTLIERS_PER_END = 1 / 500
 """Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
 _NEARER = 0.04
 """Share of the view's side by which something nearer than the object hides what is behind it."""
-_ROUNDS = 3
-"""Readings of z that settle where a pixel of the view looks."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -339,6 +337,7 @@ def _resample(
     ``whole`` is left, top, right and bottom of the whole image in the crop: beyond it the object may go on.  Where it
     is empty, that is not asked.
     """
+    rounds = 3  # readings of z that settle where a pixel of the view looks
     fx, fy, cx, cy, pinhole = lens
     height, width = image.shape
     left, top, right, bottom = whole
@@ -347,7 +346,7 @@ def _resample(
     for i in range(pixels):
         y = anchor[1] - ((i + 0.5) / pixels - 0.5) * extent
         z[:] = z_guess
-        for step in range(_ROUNDS + 1):
+        for step in range(rounds + 1):
             for j in range(pixels):  # without a branch: vector code
                 x = anchor[0] + ((j + 0.5) / pixels - 0.5) * extent
                 px = x * matrix[0, 0] + y * matrix[1, 0] + z[j] * matrix[2, 0]
@@ -357,7 +356,7 @@ def _resample(
                 ahead = pz > 0 or not pinhole
                 us[j] = np.rint(fx * px * scale + cx) if ahead else np.inf
                 vs[j] = np.rint(fy * py * scale + cy) if ahead else np.inf
-            if not pinhole or step == _ROUNDS:
+            if not pinhole or step == rounds:
                 break
             for j in range(pixels):
                 z[j] = filled[int(min(max(vs[j], 0), height - 1)), int(min(max(us[j], 0), width - 1))]

@@ -42,8 +42,6 @@ from sq_perception.imaging.distortion import Distortion
 
 LARGEST_SIDE = 2**15 - 2
 """Largest side of an image that OpenCV can look up, pixels."""
-_BORDER = 64
-"""Places on each side of the raw image whose rays bound what it sees."""
 _STEEPEST = 10.0
 """Tangent of the incidence beyond which a step between neighbours is a jump."""
 _OUTSIDE = -9.0
@@ -179,8 +177,9 @@ def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 def _window(raw: Camera, distortion: Distortion) -> tuple[int, int, int, int]:
     """First and last column and row (left, top, right, bottom) of the pinhole image, on the grid of the raw one."""
+    places = 64  # places on each side of the raw image whose rays bound what it sees
     width, height = float(raw.width), float(raw.height)
-    across, down = np.linspace(0, width - 1, _BORDER), np.linspace(0, height - 1, _BORDER)
+    across, down = np.linspace(0, width - 1, places), np.linspace(0, height - 1, places)
     ends = np.array([0.0, 1.0])
     sides = _rays(raw, across, ends * (height - 1)), _rays(raw, ends * (width - 1), down)
     border = np.concatenate([_pixels(raw, distortion.inverse(side)).reshape(-1, 2) for side in sides])

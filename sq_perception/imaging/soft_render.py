@@ -74,10 +74,6 @@ def _check_positive(name: str, value: float) -> None:
         raise ValueError(f"{name}: expected a positive number, got {value}")
 
 
-_LAYER = 6.0
-"""The layer ends where s (g^2 - 1) or the optical depth has this value: V, or what is still seen, is below 1/400."""
-
-
 def of_view(
     view: torch.Tensor, stride: int = 1, row: int = 0, column: int = 0, framing: str = "cropped"
 ) -> tuple[torch.Tensor, torch.Tensor]:
@@ -140,17 +136,19 @@ def _layer(
     bodies: Superquadric, lines: torch.Tensor, sharpness: float, density: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """First and last z (n, r), seen from the viewer, between which a line's soft depth is decided."""
+    # The layer ends where s (g^2 - 1) or the optical depth has this value: V, or what is still seen, is below 1/400.
+    layer = 6.0
     search = _Search(bodies, lines)
     nearest = search.nearest()
     least = search.gauge(nearest)
     # A line that passes the layer by meets the body's faint outside all the same: where it is least faint.
-    level = torch.sqrt(least.clamp(min=1.0) ** 2 + _LAYER / sharpness)
+    level = torch.sqrt(least.clamp(min=1.0) ** 2 + layer / sharpness)
     # g grows by 1 over every reach, less what it was: far enough out every level is passed.
     span = (level + least) * search.reach
     first = search.crossing(level, nearest, nearest + span)
     behind = search.crossing(level, nearest, nearest - span)
     entry = search.crossing(torch.ones_like(least), nearest, first)
-    hit = entry - (first - entry) - _LAYER / density
+    hit = entry - (first - entry) - layer / density
     last = torch.where(least < 1, torch.maximum(hit, behind), behind)
     first = first.clamp(min=0.0)
     return first, torch.minimum(last.clamp(min=0.0), first)

@@ -47,8 +47,6 @@ _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things
 """Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
-_MAX_BLOCKS = 64
-_MAX_PIXELS = 1024
 
 
 class CheckpointError(ValueError):
@@ -194,6 +192,8 @@ def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Con
 
     Raises CheckpointError if it describes none.
     """
+    most_pixels = 1024
+    most_blocks = 64
     if header.get("format") != _FORMATS[kind]:
         raise CheckpointError(f"{path}: expected a header 'format: {_FORMATS[kind]}', got {header.get('format')!r}")
     if header.get("version") != VERSION:
@@ -202,8 +202,8 @@ def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Con
         values: dict[str, Any] = json.loads(header["config"])
         values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
         config = kind(**values)
-        if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
-            raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
+        if config.pixels > most_pixels or config.blocks > most_blocks:
+            raise ValueError(f"expected at most {most_pixels} pixels and {most_blocks} blocks a stage")
         if sum(math.prod(shape) for shape in layout.shapes(config).values()) > _MAX_PARAMETERS:
             raise ValueError("the network would be larger than any this package trains")
     except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:

@@ -32,14 +32,7 @@ _G = {
     4: np.array([[2, 0, 0], [1, 1, 1], [1, -1, 1], [0, 0, 2]]) / 2,
     6: np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]]) / 24,
 }
-_FEW = 16
-"""Channels: up to here tiles take longer to write than products of matrices; views of 32 x 32 pixels take 0.4 of it."""
-_WIDE = 256
-"""Channels: here tiles of 4 x 4 are taken, as to read matrices of those of 6 x 6 takes longer than they save."""
 _ZERO, _2, _4, _5, _8 = (np.float32(number) for number in (0, 2, 4, 5, 8))
-_CACHED, _FEWEST_ROWS = 130_000, 160
-"""Numbers that stay in a processor's cache between two steps of a layer, and rows of a product that are worth reading
-its matrix: chosen on a cache of 1 MB a core."""
 
 
 class Memory(threading.local):
@@ -116,7 +109,8 @@ class _Tiled:
     def fold(cls, weights: Weights, name: str, norm: str) -> _Tiled:
         kernels, bias = _fold_norm(weights, name, norm)
         inputs = kernels.shape[1]
-        g = _G[4 if inputs >= _WIDE else 6]
+        # Channels: here tiles of 4 x 4 are taken, as to read matrices of those of 6 x 6 takes longer than they save.
+        g = _G[4 if inputs >= 256 else 6]
         # g w g^T of all kernels as one product: a sum over four indices takes thirty times as long, at every start.
         taps = kernels.transpose(2, 3, 1, 0).reshape(g.shape[1] ** 2, -1)
         tiles = np.kron(g, g) @ taps
@@ -171,14 +165,18 @@ class Block:
 
 def _keep_resolution(weights: Weights, name: str, norm: str) -> Direct | _Tiled:
     """A convolution that keeps the resolution."""
-    if weights[f"{name}.weight"].shape[1] <= _FEW:
+    # Channels: up to here tiles take longer to write than products of matrices; views of 32 x 32 pixels take 0.4 of it.
+    if weights[f"{name}.weight"].shape[1] <= 16:
         return Direct.fold(weights, name, norm, stride=1)
     return _Tiled.fold(weights, name, norm)
 
 
 def _parts(images: int, rows: int, columns: int) -> Iterator[slice]:
     """Slices of some images that go through a layer's product together, each (rows, columns) in it."""
-    at_once = max(1, _CACHED // (rows * columns), _FEWEST_ROWS // rows)
+    # Numbers that stay in a processor's cache between two steps of a layer, and rows of a product that are worth
+    # reading its matrix: chosen on a cache of 1 MB a core.
+    cached, fewest_rows = 130_000, 160
+    at_once = max(1, cached // (rows * columns), fewest_rows // rows)
     return (slice(first, min(first + at_once, images)) for first in range(0, images, at_once))
 
 

@@ -35,8 +35,6 @@ from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
 Filling = Literal["left", "farthest", "nearest"]
-_BLOCK = 8
-"""Side of JPEG's blocks, pixels."""
 
 
 @dataclass(frozen=True)
@@ -187,13 +185,14 @@ def blocks(depth: np.ndarray, quantum: float) -> np.ndarray:
     The steps of waves grow with their frequency, (1 + i + j) quantum, as those of JPEG do about.  Missing readings are
     0 in the image that is compressed, and known to be missing afterwards, as a mask goes with it.
     """
+    side = 8  # side of JPEG's blocks, pixels
     height, width = depth.shape
     w = np.nan_to_num(_inverse(depth), nan=0.0)
-    w = np.pad(w, ((0, -height % _BLOCK), (0, -width % _BLOCK)), mode="edge")
-    steps = np.float32(quantum * _BLOCK) * (1 + np.add(*np.indices((_BLOCK, _BLOCK), np.float32)))
-    for top in range(0, height, _BLOCK):
-        for left in range(0, width, _BLOCK):
-            block = np.s_[top : top + _BLOCK, left : left + _BLOCK]
+    w = np.pad(w, ((0, -height % side), (0, -width % side)), mode="edge")
+    steps = np.float32(quantum * side) * (1 + np.add(*np.indices((side, side), np.float32)))
+    for top in range(0, height, side):
+        for left in range(0, width, side):
+            block = np.s_[top : top + side, left : left + side]
             w[block] = cv2.idct(np.rint(cv2.dct(w[block]) / steps) * steps)
     w = np.where(w < quantum, np.float32(np.nan), w)[:height, :width]
     return np.where(np.isnan(depth), np.float32(np.nan), _inverse(w))

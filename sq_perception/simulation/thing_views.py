@@ -43,7 +43,6 @@ _PIXELS = 64
 """Side of the views: what the network of objects takes."""
 _LEAST_SEEN = 40
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
-_ATTEMPTS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +80,8 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
 
 def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
     """Draw an object, its view, the plane in the view's frame and its support function."""
-    for _ in range(_ATTEMPTS):
+    attempts = 50
+    for _ in range(attempts):
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < 0.5 else draw_thing(rng)
         setting = draw_setting(thing, rng)
         stages = draw_stages(rng)
@@ -109,7 +109,7 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         if np.abs(reach).max() > 3.0 or (reach + reach[_OPPOSITE]).max() < 0.6:
             continue
         return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
-    raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
+    raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {attempts} attempts")
 
 
 def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:

@@ -198,9 +198,6 @@ def cheapest(cost: np.ndarray) -> np.ndarray:
 LIMITS = {3: 16.266236196238125, 5: 20.515005652432876, LENGTH: 31.26413362023999}
 """chi-squared numbers of so many dimensions stay below with probability 0.999.  Chosen: one good observation in 1000 is
 doubted."""
-STILL_SHARE = 0.05
-"""No motion: displacements below this share of the mean half size, and rotations below so many radians.  Chosen: one or
-two millimetres of a household thing, 3 degrees."""
 
 
 class Agreement(NamedTuple):
@@ -215,12 +212,15 @@ class Agreement(NamedTuple):
 
 def compare(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement:
     """The agreement of errors (n, 11) with covariances S (n, 11, 11), of bodies with half sizes (n, 3)."""
+    # No motion: displacements below this share of the mean half size, and rotations below so many radians. Chosen: one
+    # or two millimetres of a household thing, 3 degrees.
+    still = 0.05
 
     def is_outside(part: slice) -> np.ndarray:
         return state.mahalanobis(total[:, part, part], error[:, part]) > LIMITS[part.stop - part.start]
 
-    slid = is_outside(CENTRE) & (np.linalg.norm(error[:, CENTRE], axis=-1) > STILL_SHARE * size.mean(axis=-1))
-    turned = is_outside(TURN) & (np.linalg.norm(error[:, TURN], axis=-1) > STILL_SHARE)
+    slid = is_outside(CENTRE) & (np.linalg.norm(error[:, CENTRE], axis=-1) > still * size.mean(axis=-1))
+    turned = is_outside(TURN) & (np.linalg.norm(error[:, TURN], axis=-1) > still)
     excess = state.mahalanobis(total, error) / LIMITS[LENGTH]
     return Agreement((excess <= 1) & ~slid & ~turned, ~is_outside(SIZE_AND_SHAPE), slid, turned, np.maximum(excess, 1))
 

@@ -39,8 +39,6 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state as states
 from sq_perception.tracking.state import CENTRE, LENGTH, TURN
 
-VIEW_ANGLE = 0.25
-"""Radians: views closer than this share b_c.  Chosen: outlines change little within 14 degrees."""
 VIEWS = 16
 """Directions that are kept for each body: two thirds of a circle at VIEW_ANGLE."""
 
@@ -111,7 +109,8 @@ def update(track: Estimate, seen: Observation, turning: np.ndarray) -> Estimate:
     biases, correlations = track.biases.copy(), track.correlations.copy()
     likeness = np.einsum("nmi,ni->nm", directions, local)
     place = np.argmax(likeness, axis=1)
-    is_new = likeness[row, place] < np.cos(VIEW_ANGLE)
+    # Radians: views closer than this share b_c. Chosen: outlines change little within 14 degrees.
+    is_new = likeness[row, place] < np.cos(0.25)
     place = np.where(is_new, np.argmin(used, axis=1), place)
     directions[row[is_new], place[is_new]] = local[is_new]
     used[row, place] = used.max(axis=1) + 1

@@ -42,8 +42,6 @@ PREDICTED_SHARE = 0.6
 degrees about them, 90 instead of 84 % of the half sizes are within two deviations, of single frames 93 %."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
-_LEAST_WHITE = 1e-6
-"""Share of F that is new in every observation: of exact ones, such as a simulator's, S has no inverse without it."""
 UNKNOWN = 0.15, 0.2, 0.15, 0.2
 """Deviations (sizes as shares, exponents, centre as a share of the mean half size, turn) of observations without
 covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
@@ -69,11 +67,14 @@ class _Frame(NamedTuple):
 
     def observe(self, pairs: Pairs) -> Observation:
         """The parts of the errors of some observations, in the forms of their tracks."""
+        # Share of F that is new in every observation: of exact ones, such as a simulator's, S has no inverse without
+        # it.
+        least_white = 1e-6
         gamma, least = self.gamma[pairs.observed, None, None], _least(pairs.state)
         return Observation(
             pairs.state,
-            (1 - COMMON_SHARE - gamma) * pairs.covariance + _LEAST_WHITE * least,
-            COMMON_SHARE * pairs.covariance + (1 - _LEAST_WHITE) * least,
+            (1 - COMMON_SHARE - gamma) * pairs.covariance + least_white * least,
+            COMMON_SHARE * pairs.covariance + (1 - least_white) * least,
             gamma * pairs.covariance,
             self.direction[pairs.observed],
         )
