@@ -51,12 +51,11 @@ FORMATS = ("glb", "ply", "stl", "obj")
 def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:
     """Return the closed triangle mesh of one body as arrays.
 
-    body: A single NumPy body.
     resolution: Points around and rows from pole to pole; a multiple of 8, so that the corners of a box are among the
         points.
 
-    vertices: (n, 3), on the surface, in the body's parent frame.
-    faces: (m, 3), indices of vertices; watertight, faces outwards; convex without a taper.
+    Returns vertices (n, 3) on the surface, in the body's parent frame, and faces (m, 3) of indices of vertices:
+    watertight, outwards, convex without a taper.
     """
     from scipy.spatial import ConvexHull  # here: a node that recovers does without
 

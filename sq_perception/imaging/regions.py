@@ -133,10 +133,9 @@ def borders(
     """How often each two of the labels 0 to ``count`` are next to each other along the rows and the columns of an
     image, across pixels without a depth (0); the image's border is of label 0.
 
-    met: (count + 1, count + 1), number of all of these contacts.
-    beside: Number of those at which the two are less than ``near`` metres apart along the line of sight; 0 for label 0.
-    behind: Number of those at which a (row) is farther than b (column) by a depth step, and by less than ``far``
-        metres.
+    Returns three numbers of contacts (count + 1, count + 1): of all; of those at which the two are less than ``near``
+    metres apart along the line of sight, 0 for label 0; of those at which a (row) is farther than b (column) by a depth
+    step, and by less than ``far`` metres.
     """
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near, far)

@@ -45,8 +45,8 @@ def render_things(
     table: (4,), a plane n.p + d = 0, n up, that objects stand on.
     behind: Depth of a wall across the whole image, metres.
 
-    depth: float64 (height, width), metres, +inf where there is nothing.
-    thing: int32 (height, width), owner of the visible part, -1 where there is none.
+    Returns depth, float64 (height, width), metres, +inf where there is nothing, and the visible part's owner, int32
+    (height, width), -1 where there is none.
     """
     depth, index = render(parts, camera)
     thing = np.append(np.asarray(owner, dtype=np.int32), np.int32(-1))[index]

@@ -67,9 +67,7 @@ def render_views(
     miss: (n, 4), how far the view's middle (x, y), nearest depth (z) and the logarithm of its side are off, the first
         three in sides: errors of a mask and of noisy depths.
 
-    images: float32 (n, pixels, pixels).
-    bodies: The batch in the canonical frame of its views.
-
+    Returns images, float32 (n, pixels, pixels), and the batch in the canonical frame of its views.
     Raises ValueError for a distance that is not positive, or a share outside of [0, 1).
     """
     lower, upper = bodies.bounding_box()
