@@ -93,7 +93,7 @@ def _aligned(scene: Tabletop) -> Image:
     camera, place = scene.camera, np.array([-BESIDE, 0.0, 0.0])
 
     def moved(depth: np.ndarray) -> np.ndarray:
-        return camera_stages.aligned(depth.astype(np.float32), camera, place, camera, False)
+        return camera_stages.align(depth.astype(np.float32), camera, place, camera, False)
 
     depth, labels = moved(scene.depth), np.zeros_like(scene.labels)
     for label in np.unique(scene.labels[scene.labels > 0]):
@@ -107,7 +107,7 @@ STAGES: dict[str, Callable[[Tabletop], Image]] = {
     "smoothed 3": lambda scene: _smoothed(scene, 3),
     "smoothed 6": lambda scene: _smoothed(scene, 6),
     "spatial": _spatial,
-    "filled": lambda scene: Image(camera_stages.filled(scene.depth, "farthest"), scene.labels),
+    "filled": lambda scene: Image(camera_stages.fill(scene.depth, "farthest"), scene.labels),
     "ring 2": lambda scene: _ring(scene, 2),
     "ring 4": lambda scene: _ring(scene, 4),
     "aligned": _aligned,

@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 from common import report
 
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.learning.inference import ThingPredictor, load_things
 from sq_perception.simulation import thing_views
 from sq_perception.simulation.camera_stages import RANGES, Filling, StageRanges, Stages, draw_stages

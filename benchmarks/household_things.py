@@ -63,7 +63,7 @@ def scene(
 
 def sensed(truth: ThingsOnTable, seed: int, sensor: str, rng: np.random.Generator) -> tabletop.Tabletop:
     """A scene through a sensor of :data:`tabletop.SENSORS`."""
-    depth = sensor_noise.preset(tabletop.SENSORS[sensor]).measured(truth.depth, truth.camera, rng)
+    depth = sensor_noise.preset(tabletop.SENSORS[sensor]).measure(truth.depth, truth.camera, rng)
     placed = tuple(_known(each, truth) for each in truth.placed)
     return tabletop.Tabletop(
         seed, sensor, truth.camera, depth, truth.depth, truth.labels, truth.plane, truth.table, placed

@@ -99,7 +99,7 @@ def sparse(scene: Tabletop, missing: Callable[[np.ndarray, np.ndarray], np.ndarr
 def resized(scene: Tabletop, times: float, sensor: str) -> Tabletop:
     """With all lengths multiplied, as a sensor sees it."""
     rng, true_depth = np.random.default_rng([scene.seed]), times * scene.true_depth
-    depth = sensor_noise.preset(sensor).measured(true_depth, scene.camera, rng)
+    depth = sensor_noise.preset(sensor).measure(true_depth, scene.camera, rng)
     plane = scene.plane * np.array([1.0, 1.0, 1.0, times])
     placed = tuple(
         replace(one, thing=resized_thing(one.thing, times), translation=times * one.translation) for one in scene.placed

@@ -85,7 +85,7 @@ def seen_scene(kinds: list[str] | None, count: int, seed: list[int]) -> tuple[Th
         truth = things_on_table(rng, count, kinds=kinds)
     except ValueError:
         return None
-    return truth, sensor_noise.preset("realsense_d435").measured(truth.depth, truth.camera, rng)
+    return truth, sensor_noise.preset("realsense_d435").measure(truth.depth, truth.camera, rng)
 
 
 def iou(truth: list[Superquadric], found: list[Superquadric]) -> float:

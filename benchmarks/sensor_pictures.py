@@ -37,7 +37,7 @@ def main() -> None:
     grid = figure.subplots(2, len(models), gridspec_kw={"wspace": 0.02, "hspace": 0.03})
     figure.subplots_adjust(left=0.005, right=0.995, top=0.935, bottom=0.01)
     for (above, below), (name, model) in zip(grid.T, models.items(), strict=True):
-        measured = model.measured(true, scene.camera, np.random.default_rng(1))[WINDOW]
+        measured = model.measure(true, scene.camera, np.random.default_rng(1))[WINDOW]
         draw_depth(above, measured, limits)
         above.set_title(name, fontsize=11, color=INK, pad=4)
         below.set_axis_off()

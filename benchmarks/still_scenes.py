@@ -49,7 +49,7 @@ def measured(recoverer: Recoverer, count: int, scenes: int, frames: int, sensor:
         noise, still = sensor_noise.preset(tabletop.SENSORS[sensor]), StillScene(recoverer)
         for number in range(frames):
             rng = np.random.default_rng([household_things.SEED, seed, count, number])
-            depth = noise.measured(scene.true_depth, scene.camera, rng)
+            depth = noise.measure(scene.true_depth, scene.camera, rng)
             moments = [time.process_time()]
             alone = recoverer.recover(depth, scene.camera)
             moments.append(time.process_time())

@@ -93,7 +93,7 @@ def sensed(scene: Scene, sensor: str, rng: np.random.Generator) -> SensedScene:
     if sensor == PLAIN:
         depth = np.round(1e3 * (depth + 1.5e-3 * depth**2 * rng.standard_normal(depth.shape))) / 1e3
     else:
-        depth = sensor_noise.preset(sensor).measured(depth, scene.camera, rng)
+        depth = sensor_noise.preset(sensor).measure(depth, scene.camera, rng)
     depth = depth.astype(np.float32)
     return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), visible)
 

@@ -47,7 +47,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation.scenes import Scene, table_scene
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, preset
-from sq_perception.tracking.forms import TURNS
+from sq_perception.tracking.association import TURNS
 from sq_perception.tracking.session import Followed, TrackingSession
 
 BODIES = 5
@@ -154,7 +154,7 @@ def views(shown: Scene, row: Row, frames: int, rng: np.random.Generator) -> Iter
     for k in range(frames):
         here, pose = moved(shown, row.arc * k / max(frames - 1, 1))
         depth, labels = here.render()
-        yield View(here, row.sensor.measured(depth, here.camera, rng), labels, visible_shares(here, labels), pose)
+        yield View(here, row.sensor.measure(depth, here.camera, rng), labels, visible_shares(here, labels), pose)
 
 
 def size_errors(body: Superquadric, truth: Superquadric) -> tuple[np.ndarray, np.ndarray]:

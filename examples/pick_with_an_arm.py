@@ -211,7 +211,7 @@ class Eyes:
     def grasps(self, depth: np.ndarray) -> grasps.GraspArray:
         """Publish a depth image until its grasps come back."""
         i = self.camera.intrinsics
-        measured = self.noise.measured(depth, Pinhole(i.width, i.height, i.fx, i.fy, i.cx, i.cy), self.rng)
+        measured = self.noise.measure(depth, Pinhole(i.width, i.height, i.fx, i.fy, i.cx, i.cy), self.rng)
         first = time.time()
         while rclpy.ok() and time.time() < first + 600:  # the first answer compiles
             header = Header(stamp=self.node.get_clock().now().to_msg(), frame_id="camera_depth_optical_frame")

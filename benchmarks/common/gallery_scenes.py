@@ -55,7 +55,7 @@ def viewed(things: Sequence[Stood], sensor: str, down: float, distance: float) -
             raise ValueError(f"{each.name}: stands where another thing is")
         placed.append((replace(each.thing, name=each.name), "", table @ turn, table @ place + origin))
     true, labels, known = tabletop.rendered(placed, plane_depth(plane, camera))
-    depth = sensor_noise.preset(sensor).measured(true, camera, np.random.default_rng(0))
+    depth = sensor_noise.preset(sensor).measure(true, camera, np.random.default_rng(0))
     return Tabletop(0, sensor, camera, depth, true, labels, plane, table, known)
 
 

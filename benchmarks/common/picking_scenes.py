@@ -99,7 +99,7 @@ def observed(world: World, sensor: str, rng: np.random.Generator) -> np.ndarray:
     table = quaternions.to_matrix(LOOK)[:, 2]
     plane = np.append(table, -table @ EYE)
     depth, _ = render_things(parts, owner, cavities, cavity_owner, TABLE_CAMERA, plane)
-    return sensor_noise.preset(sensor).measured(depth, TABLE_CAMERA, rng)
+    return sensor_noise.preset(sensor).measure(depth, TABLE_CAMERA, rng)
 
 
 def seen(world: World, bodies: list[Superquadric]) -> tuple[Superquadric, np.ndarray]:

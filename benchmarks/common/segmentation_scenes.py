@@ -71,7 +71,7 @@ def scene(kind: str, seed: int) -> SegmentationScene:
         measured = thing_views.measure_by_any(depth, seen, camera, Stages(), rng)
     else:
         sensor = str(rng.choice(list(sensor_noise.PRESETS)))
-        measured = sensor_noise.preset(sensor).measured(depth, camera, rng)
+        measured = sensor_noise.preset(sensor).measure(depth, camera, rng)
     if rng.random() < _BENT:
         measured = measured * _bent(camera, rng)
     return SegmentationScene(kind, seed, sensor, measured.astype(np.float32), labels.astype(np.int32), camera)

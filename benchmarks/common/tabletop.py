@@ -252,7 +252,7 @@ def _seen(
         for thing, (rest, pose) in zip(things, poses, strict=True)
     ]
     depth, labels, placed = rendered(lying, _background(stand))
-    measured = model.measured(depth, CAMERA, rng)
+    measured = model.measure(depth, CAMERA, rng)
     return Tabletop(seed, sensor, CAMERA, measured, depth, labels, stand.plane, stand.table, placed)
 
 

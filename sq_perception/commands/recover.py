@@ -126,7 +126,7 @@ def recover(arguments: Sequence[str]) -> int:
     add("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write the bodies of each frame as a mesh into this folder")
-    add("--mesh-format", choices=("glb", "ply", "stl", "obj", "dae"), default="glb", help="of --meshes (default glb)")
+    add("--mesh-format", choices=("glb", "ply", "stl", "obj"), default="glb", help="of --meshes (default glb)")
     add(
         "--export", choices=("urdf", "sdf", "mjcf", "curobo"), help="write the bodies of each frame as obstacles, below"
     )

@@ -265,9 +265,8 @@ def _run_evaluation(options: argparse.Namespace, methods: list[Method], command:
     import numba
     import torch
 
-    from sq_perception.evaluation import thesis_report, thesis_tables
-    from sq_perception.evaluation.contest import compare
-    from sq_perception.evaluation.thesis_images import ThesisImages
+    from sq_perception.evaluation import thesis_report
+    from sq_perception.evaluation.contest import ThesisImages, compare
     from sq_perception.files import provenance
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
@@ -287,7 +286,7 @@ def _run_evaluation(options: argparse.Namespace, methods: list[Method], command:
         "spawn_key": "(6, block), blocks of 500 bodies",
     }
     written, entries = thesis_report.write(options.output, outcomes, images, facts, failures)
-    print("\n\n".join(table.markdown() for table in thesis_tables.overview(entries)))
+    print("\n\n".join(table.markdown() for table in thesis_report.overview(entries)))
     print(f"written: {written}")
     return FAILURE if failures else SUCCESS
 

@@ -24,8 +24,6 @@ from sq_perception.imaging.camera import Camera
 
 _LIGHT = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
 """Towards the light, in the frame of the picture: from the upper left, in front."""
-_MOST_POINTS = 1500
-"""Points that are drawn of the cloud of one body."""
 
 
 def draw_bodies_3d(
@@ -43,26 +41,15 @@ def draw_bodies_3d(
 ) -> None:
     """Shaded picture of bodies of the optical frame from another place, exact as the depth images are.
 
-    Parameters
-    ----------
-    ax : Axes
-        Plain 2D axes.
-    bodies
-        Single bodies.
-    points
-        Measured points (n, 3) per body, some of which are drawn as dots where no body hides them.
-    plane : (4,), optional
-        Support plane: up is along its normal, and it is drawn as a grid with the bodies' footprints.
-    colours
-        One per body.
-    elevation, azimuth
-        Where one looks from, degrees: 0, 0 is the camera's side, azimuth 90 the right.
-    unit
-        Name of the unit at the scale bar.
-    pixels
-        Width and height of the picture.
-    wires
-        Lines (n, 3), of the true bodies for instance, drawn in front of everything.
+    ax: Plain 2D axes.
+    bodies: Single bodies.
+    points: Measured points (n, 3) per body, some of which are drawn as dots where no body hides them.
+    plane: (4,), support plane: up is along its normal, and it is drawn as a grid with the bodies' footprints.
+    colours: One per body.
+    elevation, azimuth: Where one looks from, degrees: 0, 0 is the camera's side, azimuth 90 the right.
+    unit: Name of the unit at the scale bar.
+    pixels: Width and height of the picture.
+    wires: Lines (n, 3), of the true bodies for instance, drawn in front of everything.
     """
     ax.set_axis_off()
     if not bodies:
@@ -96,7 +83,8 @@ def draw_bodies_3d(
         edges = LineCollection(segments[seen][..., :2], colors=[0.35 * shade], linewidths=0.9, zorder=3)
         ax.add_collection(edges, autolim=False)
     for cloud, shade in zip(clouds, shades, strict=False):
-        cloud = cloud[:: max(1, len(cloud) // _MOST_POINTS)]
+        # Points that are drawn of the cloud of one body.
+        cloud = cloud[:: max(1, len(cloud) // 1500)]
         cloud = cloud[~_hidden(cloud, depth, camera, 0.02 * half)]
         ax.scatter(cloud[:, 0], cloud[:, 1], s=1.6, color=[0.25 * shade], alpha=0.55, linewidths=0, zorder=4)
     cages = LineCollection([line[:, :2] for line in lines], colors=[WIRE], linewidths=1.0, zorder=5)

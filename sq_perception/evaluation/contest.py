@@ -8,6 +8,11 @@ images, fits on every image they get.
 The loss that a network was trained by, from its file's header, decides its row of the thesis' tables and what
 was given to it: under occupancy_rotation, size, shape and place are those of the label.  Labels list their axes as a
 training listed them, with a1 >= a2 for ``canonical_labels`` and for the fits, whose results are in canonical form.
+
+The test set has bodies of the thesis' protocol (chapter 5.1; :mod:`sq_perception.simulation.scenes`), which no training
+has seen: images of 256 x 256 pixels whose grey value is the floor of 255 z.  Bodies come in blocks of 500, block b from
+the generator of ``SeedSequence(seed, spawn_key=(6, b))``, so that the first n are the same however many are drawn.
+Training draws from ``[seed, step]`` and validates on ``0``: no spawn key, hence other numbers for every seed.
 """
 
 from __future__ import annotations
@@ -16,29 +21,62 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit
-from sq_perception.evaluation.protocol import FITS
-from sq_perception.evaluation.thesis_images import CAMERA, ThesisImages
+from sq_perception.evaluation.protocol import DEFAULT_SEED, FITS
 from sq_perception.files.output_file import free_name
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import unit_cube
+from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import LOSSES
 from sq_perception.learning.inference import Predictor
 from sq_perception.learning.losses import Objective
 from sq_perception.recovery.recoverer import FrameRecovery, Method, Recoverer
 from sq_perception.segmentation import segments
+from sq_perception.simulation.scenes import thesis_bodies
 
-TIMED_IMAGES = 300
-_NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
-"""Placeholder where nothing was recovered, outside of the cube."""
+CAMERA = unit_cube.camera()
+"""The orthographic camera of all images."""
+CHUNK = 200
+"""Images in memory at a time, 50 MB; changes no result."""
+
+
+@dataclass(frozen=True)
+class ThesisImages:
+    """The test set of ``count`` bodies; a ValueError for fewer than one, or a negative seed."""
+
+    count: int
+    seed: int = DEFAULT_SEED
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.seed < 0:
+            raise ValueError(f"expected at least 1 body and a seed of at least 0, got {self.count}, seed {self.seed}")
+
+    @cached_property
+    def truth(self) -> Superquadric:
+        """All bodies (count,) in the cube frame."""
+        block_size = 500
+        blocks = []
+        for block in range(-(-self.count // block_size)):
+            seeds = np.random.SeedSequence(self.seed, spawn_key=(6, block))
+            blocks.append(thesis_bodies(block_size, np.random.default_rng(seeds)).to_flat())
+        return Superquadric.from_flat(np.concatenate(blocks)[: self.count])
+
+    def image(self, number: int) -> np.ndarray:
+        """Depth float32 (256, 256) of one body, NaN for background."""
+        depth, _ = raycast.render(unit_cube.optical_from_cube(self.truth[number]), CAMERA)
+        return unit_cube.depth_from_grey(unit_cube.grey_from_depth(depth))
+
+    def chunks(self) -> Iterator[tuple[int, np.ndarray]]:
+        """All images, some at a time: the number of the first body, and depth (n, 256, 256)."""
+        for first in range(0, self.count, CHUNK):
+            yield first, np.stack([self.image(number) for number in range(first, min(first + CHUNK, self.count))])
 
 
 class Answers(NamedTuple):
@@ -126,7 +164,7 @@ def _predict(model: Predictor, recoverer: Recoverer, first: int, images: np.ndar
         for (k, view), body in zip(views.items(), predicted, strict=True):
             bodies[k] = unit_cube.cube_from_optical(view.from_canonical(body)).to_flat()
     milliseconds = np.full(len(images), np.nan)
-    timed = images[: max(0, TIMED_IMAGES - first)]
+    timed = images[: max(0, 300 - first)]
     milliseconds[: len(timed)] = [frame.milliseconds["total"] for frame in _frames(recoverer, first, timed)]
     return Answers(bodies, milliseconds)
 
@@ -164,13 +202,8 @@ def compare(
 ) -> list[Outcome]:
     """Have every contestant recover the first bodies of the test set.
 
-    Parameters
-    ----------
-    contestants
-        Each with the number of its bodies, at most those of the test set.
-    images : ThesisImages
-    advance
-        Called with a contestant's name and the number of bodies done.
+    contestants: Each with the number of its bodies, at most those of the test set.
+    advance: Called with a contestant's name and the number of bodies done.
 
     Raises ValueError if a contestant is to recover no body, or more than there are.
     """
@@ -190,7 +223,9 @@ def compare(
         flat, milliseconds = (np.concatenate(parts) for parts in zip(*mine, strict=True))
         recovered = np.isfinite(flat).all(axis=1)
         labels = contestant.labels(images.truth[:count])
-        bodies = Superquadric.from_flat(np.where(recovered[:, None], flat, _NOBODY))
+        # Placeholder where nothing was recovered, outside of the cube.
+        nobody = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
+        bodies = Superquadric.from_flat(np.where(recovered[:, None], flat, nobody))
         bodies = contestant.with_given(bodies, labels)
         outcomes.append(Outcome(contestant, FiguresOfMerit.of(bodies, labels, recovered, milliseconds), bodies, labels))
     return outcomes

@@ -16,29 +16,25 @@ from matplotlib.patches import Patch
 
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
-from sq_perception.evaluation.contest import Outcome
+from sq_perception.evaluation.contest import CAMERA, Outcome, ThesisImages
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
-from sq_perception.evaluation.thesis_images import CAMERA, ThesisImages
 from sq_perception.geometry.mesh import outline
 from sq_perception.imaging import raycast, unit_cube
 
 _BAR = "#7f97aa"
 _GRID = "#dfe5ea"
 _EACH = 3
-_ARC_BINS = np.linspace(0, 360, 121)
-_BINS = np.linspace(0, 100, 101)
-"""Edges of bins for IoU in per cent and for angles in degrees."""
-_CLOSE_IOU_BINS = np.linspace(95, 100, 101)
-"""Where every body is this good."""
 
 
 def distributions(outcome: Outcome) -> Figure:
     """IoU (as figures 6.6, 7.3, 7.7), shortest arc (figure 6.3) and the angle that is a property of the bodies."""
+    bins_of_100 = np.linspace(0, 100, 101)  # edges of bins for IoU in per cent and for angles in degrees
+    close = np.linspace(95, 100, 101)  # where every body is this good
     figure = plots.new_figure(14.0, 3.5)
     grid = figure.add_gridspec(1, 3, left=0.045, right=0.985, bottom=0.15, top=0.88, wspace=0.17)
     figures, summary = outcome.figures, outcome.figures.summary()
 
-    bins = _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _BINS
+    bins = close if summary["iou_min"] > 0.01 * close[0] else bins_of_100
     ax = _histogram(figure.add_subplot(grid[0]), 100 * figures.iou, bins, "IoU, per cent")
     ax.axvline(100 * summary["iou_mean"], color=plots.WIRE, lw=1.2)
     low, high = (100 * (summary["iou_mean"] + side * summary["iou_std"]) for side in (-1, 1))
@@ -46,14 +42,14 @@ def distributions(outcome: Outcome) -> Figure:
     ax.set_ylabel("bodies", fontsize=9, color=plots.INK)
     plots.heading_of(ax, "IoU", f"{100 * summary['over_85']:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
 
-    ax = _histogram(figure.add_subplot(grid[1]), np.rad2deg(figures.shortest_arc), _ARC_BINS, "radians")
+    ax = _histogram(figure.add_subplot(grid[1]), np.rad2deg(figures.shortest_arc), np.linspace(0, 360, 121), "radians")
     ax.set_xticks(np.arange(0, 361, 90), ["0", "π/2", "π", "3π/2", "2π"])
     turned = f"{100 * summary['quarter_turns']:.0f} % quarter turns"
     plots.heading_of(ax, "Arc to the label (figure 6.3)", turned)
 
-    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), _BINS, "degrees")
+    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), bins_of_100, "degrees")
     free = np.rad2deg(figures.any_order_angle)
-    ax.hist(free[np.isfinite(free)], bins=_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
+    ax.hist(free[np.isfinite(free)], bins=bins_of_100.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
     if summary["recovered"]:
         medians = np.rad2deg([summary["symmetric_angle_median"], summary["any_order_angle_median"]])
         names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")

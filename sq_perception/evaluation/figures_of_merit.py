@@ -39,7 +39,6 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 GOOD_IOU = 0.85
-_QUARTER_TURN = np.deg2rad([70.0, 110.0])
 _CYCLES = np.array([[0.5, 0.5, 0.5, 0.5], [-0.5, -0.5, -0.5, 0.5]])
 """x to y to z to x, and back."""
 
@@ -75,13 +74,9 @@ class FiguresOfMerit:
     ) -> FiguresOfMerit:
         """Compare batches (n,) of the cube frame.
 
-        Parameters
-        ----------
-        prediction, truth : Superquadric
-            NumPy.
-        recovered : bool (n,), optional
-            Where False, there is no prediction and what stands in its place does not count.
-        milliseconds : (n,), optional
+        prediction, truth: NumPy.
+        recovered: bool (n,), where False, there is no prediction and what stands in its place does not count.
+        milliseconds: (n,).
         """
         count = len(truth)
         missing = np.zeros(count, bool) if recovered is None else ~np.asarray(recovered, dtype=bool)
@@ -115,7 +110,7 @@ class FiguresOfMerit:
         recovered = np.isfinite(self.delta_a)
         times = self.milliseconds[np.isfinite(self.milliseconds)]
         axes = self.axes_angle[recovered]
-        low, high = _QUARTER_TURN
+        low, high = np.deg2rad([70.0, 110.0])
         return {
             "bodies": len(self),
             "recovered": int(recovered.sum()),

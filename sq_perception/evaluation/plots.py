@@ -39,7 +39,6 @@ WIRE = "#d1006c"
 NOTHING = "#1b2129"
 FAINT = "#8a97a3"
 DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#8b9dab", "#566a7b", "#36475a"])
-_CONTOUR_PIXELS = 1280
 Window = tuple[float, float, float, float]
 """Left, right, top, bottom of a part of an image."""
 
@@ -96,7 +95,9 @@ def draw_outlines(
         segments = outline(body, 64)
         pixels = camera.project(segments)
         inside = np.isfinite(pixels).all(axis=(1, 2))
-        seen = _faces_camera(body, segments.mean(axis=1), camera)
+        middles = segments.mean(axis=1)
+        sight = middles if camera.is_pinhole else np.array([0.0, 0.0, 1.0])
+        seen = np.sum(body.normals(middles) * sight, axis=-1) < 0
         solid = LineCollection(pixels[inside & seen], colors=[shade], linewidths=0.55 * width)
         faint = LineCollection(pixels[inside & ~seen][::2], colors=[shade], linewidths=0.4 * width, alpha=0.6)
         for lines in (solid, faint):
@@ -150,7 +151,7 @@ def draw_grasps(
 
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:
     """Closed outlines (n, 2) of a body in the image, in pixels; cut at the image's border, empty if out of sight."""
-    k = max(1, _CONTOUR_PIXELS // max(camera.width, camera.height))
+    k = max(1, 1280 // max(camera.width, camera.height))
     cx, cy = (camera.cx + 0.5) * k - 0.5, (camera.cy + 0.5) * k - 0.5
     fine = Camera(camera.width * k, camera.height * k, camera.fx * k, camera.fy * k, cx, cy, camera.projection)
     _, index = raycast.render(body, fine)
@@ -176,11 +177,6 @@ def heading_of(ax: Axes, text: str, detail: str) -> None:
     """The title of a picture, and a remark at its right."""
     ax.set_title(text, loc="left", fontsize=11, color=INK, pad=5)
     ax.set_title(detail, loc="right", fontsize=9, color=FAINT, pad=5)
-
-
-def _faces_camera(body: Superquadric, points: np.ndarray, camera: Camera) -> np.ndarray:
-    direction = points if camera.is_pinhole else np.array([0.0, 0.0, 1.0])
-    return np.sum(body.normals(points) * direction, axis=-1) < 0
 
 
 def window_of(bodies: Sequence[Superquadric], camera: Camera, pixels: np.ndarray | None = None) -> Window:

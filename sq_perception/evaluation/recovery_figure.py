@@ -20,25 +20,14 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, edges_as_text
 from sq_perception.segmentation.segments import segment
 
-_LONGEST = 68
-"""Characters of a verdict that fit in a line."""
-_MOST_LISTED = 8
-
 
 def demo_figure(
-    depth: np.ndarray,
-    camera: Camera,
-    truth: Sequence[Superquadric],
-    methods: Mapping[str, Sequence[Superquadric]],
+    depth: np.ndarray, camera: Camera, truth: Sequence[Superquadric], methods: Mapping[str, Sequence[Superquadric]]
 ) -> Figure:
     """Draw a column for the image and its true bodies, and one a method: outlines above, bodies in space below.
 
-    Parameters
-    ----------
-    depth : (height, width)
-        Metres, NaN for no reading.
-    truth, methods
-        Single bodies in the optical frame, those of the methods by title.
+    depth: (height, width), metres, NaN for no reading.
+    truth, methods: Single bodies in the optical frame, those of the methods by title.
     """
     columns = {"true bodies": truth, **methods}
     figure = plots.new_figure(5.0 * len(columns), 8.6)
@@ -107,6 +96,8 @@ def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, 
 
 def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
     """The bodies' full edges with their deviations, exponents, score and verdict as text."""
+    most = 8
+    longest = 68  # characters of a verdict that fit in a line
     ax.set_axis_off()
     ax.set(xlim=(0, 1), ylim=(0, 1))
     total = recovery.milliseconds.get("total", float("nan"))
@@ -114,12 +105,12 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
     ax.text(1, 0.95, f"{total:.0f} ms", fontsize=9.5, color=plots.FAINT, ha="right")
     if not recovery.bodies:
         ax.text(0, 0.86, recovery.message or "no object", fontsize=9.5, color=plots.FAINT)
-    for k, body in enumerate(recovery.bodies[:_MOST_LISTED]):
+    for k, body in enumerate(recovery.bodies[:most]):
         y = 0.85 - 0.108 * k
         ax.add_patch(Rectangle((0.0, y - 0.032), 0.035, 0.064, color=plots.colour(k), lw=0))
         _number(ax, (0.0175, y), k)
         if body.status == Status.FAILED:
-            ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=plots.FAINT, va="center")
+            ax.text(0.06, y, shorten(f"failed: {body.message}", longest), fontsize=9, color=plots.FAINT, va="center")
             continue
         e1, e2 = body.superquadric.shape
         text = edges_as_text(body.superquadric.size, body.sigma_size, unit != "m").replace(" of the cube", "")
@@ -127,9 +118,9 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
         ax.text(0.06, y + 0.018, text, look)
         ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", look, ha="right")
         verdict = f"{body.status.name.lower()}: {body.message}" if body.status == Status.WEAK else body.message
-        ax.text(0.06, y - 0.032, shorten(verdict, _LONGEST), fontsize=8, color=plots.FAINT, va="center")
-    if len(recovery.bodies) > _MOST_LISTED:
-        ax.text(0, 0.0, f"and {len(recovery.bodies) - _MOST_LISTED} more", fontsize=9, color=plots.FAINT)
+        ax.text(0.06, y - 0.032, shorten(verdict, longest), fontsize=8, color=plots.FAINT, va="center")
+    if len(recovery.bodies) > most:
+        ax.text(0, 0.0, f"and {len(recovery.bodies) - most} more", fontsize=9, color=plots.FAINT)
 
 
 def _depth_bar(ax: Axes, limits: tuple[float, float], unit: str) -> None:

@@ -31,8 +31,8 @@ from sq_perception.fitting.rays import drawn, through
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.coherence import coherent
-from sq_perception.imaging.lens import heights
+from sq_perception.imaging.depth_steps import coherent
+from sq_perception.imaging.raycast import heights
 
 _STEEPEST = 6.0
 """Largest slope, 80 degrees; steeper pixels count as this, as they determine little of the depth."""

@@ -33,7 +33,7 @@ from sq_perception.fitting.quality import seen_extents
 from sq_perception.fitting.quality import status as assess
 from sq_perception.fitting.starts import ORDERS
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 
 Stages: TypeAlias = tuple[tuple[int, int, int], ...]
 MOST_POINTS = 2000

@@ -36,7 +36,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Lens
-from sq_perception.imaging.lens import point_at
+from sq_perception.imaging.raycast import point_at
 
 _BOX_EXPONENT = 0.3
 """Exponents of a start from a box, nearer to a box than to an ellipsoid; a few steps find the rest."""

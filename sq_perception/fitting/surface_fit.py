@@ -43,7 +43,7 @@ from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, c
 from sq_perception.fitting.quality import assessed, failed
 from sq_perception.geometry.quantiles import deviation
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import box, fills

@@ -47,7 +47,7 @@ def one_body(parts: list[Any]) -> np.ndarray | None:
     return numbers
 
 
-def checked_turn(parts: list[np.ndarray]) -> np.ndarray:
+def check_turn(parts: list[np.ndarray]) -> np.ndarray:
     """Check size, shape, translation, rotation and taper; return unit quaternions (..., 4).
 
     Raises ValueError unless these are the numbers of bodies.

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -44,30 +43,19 @@ Found by a random search for the greatest least difference (CIE 1976) of any two
 depth pictures, to normal, deuteranopic and protanopic eyes (Machado et al. 2009): 28.
 """
 
-FORMATS = ("glb", "ply", "stl", "obj", "dae")
+FORMATS = ("glb", "ply", "stl", "obj")
 """Suffixes of the files that :func:`export` writes."""
 
-HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Turn between the optical frame, y down, and that of viewers of meshes, y up."""
-_SAME_POINT_DIGITS = 12
 
 
 def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:
     """Return the closed triangle mesh of one body as arrays.
 
-    Parameters
-    ----------
-    body : Superquadric
-        A single NumPy body.
-    resolution : int
-        Points around and rows from pole to pole; a multiple of 8, so that the corners of a box are among the points.
+    resolution: Points around and rows from pole to pole; a multiple of 8, so that the corners of a box are among the
+        points.
 
-    Returns
-    -------
-    vertices : (n, 3)
-        On the surface, in the body's parent frame.
-    faces : (m, 3)
-        Indices of vertices; watertight, faces outwards; convex without a taper.
+    Returns vertices (n, 3) on the surface, in the body's parent frame, and faces (m, 3) of indices of vertices:
+    watertight, outwards, convex without a taper.
     """
     from scipy.spatial import ConvexHull  # here: a node that recovers does without
 
@@ -81,7 +69,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
     )
     unit = Superquadric.at_origin(np.ones(3), body.shape)
     points = unit.parametric_points(eta.ravel(), omega.ravel())
-    _, kept = np.unique(np.round(points, _SAME_POINT_DIGITS), axis=0, return_index=True)
+    _, kept = np.unique(np.round(points, 12), axis=0, return_index=True)
     points = points[np.sort(kept)]
     hull = ConvexHull(points, qhull_options="QbB Pp Qt")
     used = np.full(len(points), -1)
@@ -140,15 +128,15 @@ def export(
     bodies : Superquadric
         One, a batch (n,) or a sequence of single bodies.
     path : str or Path
-        Its suffix is one of :data:`FORMATS`: GLB, DAE and OBJ have a named object per body, PLY and STL one mesh, STL
+        Its suffix is one of :data:`FORMATS`: GLB and OBJ have a named object per body, PLY and STL one mesh, STL
         without colours.
     colours : (n, 3), optional
         Red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.
     names : (n,), optional
         Names of the nodes of a GLB; body_0, body_1 ... if not given.
     optical : bool
-        The bodies are in the optical frame (y down): a GLB and a DAE, whose y axis is up by their standards, are turned
-        half about x so that viewers show them upright.  The others always keep the coordinates.
+        The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x
+        so that viewers show them upright.  The others always keep the coordinates.
 
     Raises
     ------
@@ -181,53 +169,13 @@ def export(
         return path
     if optical and suffix != ".obj":
         for part in meshes:
-            part.apply_transform(HALF_TURN_ABOUT_X)
-    if suffix == ".dae":
-        shades = [palette[k % len(palette)] for k in range(len(meshes))]
-        path.write_bytes(_collada(list(zip(names, meshes, shades, strict=True))))
-        return path
+            # Turn between the optical frame, y down, and that of viewers of meshes, y up.
+            part.apply_transform(np.diag([1.0, -1.0, -1.0, 1.0]))
     scene = trimesh.Scene()
     for name, part in zip(names, meshes, strict=True):
         scene.add_geometry(part, node_name=name, geom_name=name)
     scene.export(path)
     return path
-
-
-def _collada(parts: Sequence[tuple[str, trimesh.Trimesh, np.ndarray]]) -> bytes:
-    """Return a COLLADA 1.4.1 document, metres, y up, of names, meshes and colours; trimesh writes none itself."""
-    root = ElementTree.Element("COLLADA", xmlns="http://www.collada.org/2005/11/COLLADASchema", version="1.4.1")
-
-    def add(parent: ElementTree.Element, tag: str, text: str = "", **attributes: str) -> ElementTree.Element:
-        made = ElementTree.SubElement(parent, tag, attributes)
-        made.text = text
-        return made
-
-    about = add(root, "asset")
-    add(about, "unit", name="metre", meter="1")
-    add(about, "up_axis", "Y_UP")
-    effects, materials, shapes = (add(root, f"library_{kind}") for kind in ("effects", "materials", "geometries"))
-    scene = add(add(root, "library_visual_scenes"), "visual_scene", id="scene")
-    for k, (name, part, shade) in enumerate(parts):
-        technique = add(add(add(effects, "effect", id=f"e{k}"), "profile_COMMON"), "technique", sid="common")
-        add(add(add(technique, "lambert"), "diffuse"), "color", " ".join(f"{channel:.4f}" for channel in (*shade, 1.0)))
-        add(add(materials, "material", id=f"m{k}"), "instance_effect", url=f"#e{k}")
-        shape = add(add(shapes, "geometry", id=f"g{k}", name=name), "mesh")
-        source = add(shape, "source", id=f"p{k}")
-        numbers = " ".join(f"{value:.7g}" for value in part.vertices.ravel())
-        add(source, "float_array", numbers, id=f"p{k}a", count=str(part.vertices.size))
-        reading = add(source, "technique_common")
-        reading = add(reading, "accessor", source=f"#p{k}a", count=str(len(part.vertices)), stride="3")
-        for axis in "XYZ":
-            add(reading, "param", name=axis, type="float")
-        add(add(shape, "vertices", id=f"v{k}"), "input", semantic="POSITION", source=f"#p{k}")
-        faces = add(shape, "triangles", count=str(len(part.faces)), material="paint")
-        add(faces, "input", semantic="VERTEX", source=f"#v{k}", offset="0")
-        add(faces, "p", " ".join(str(corner) for corner in part.faces.ravel()))
-        instance = add(add(scene, "node", id=f"n{k}", name=name), "instance_geometry", url=f"#g{k}")
-        bound = add(add(instance, "bind_material"), "technique_common")
-        add(bound, "instance_material", symbol="paint", target=f"#m{k}")
-    add(add(root, "scene"), "instance_visual_scene", url="#scene")
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
 
 
 def sample(body: Superquadric, count: int = 1000, seed: int = 0) -> np.ndarray:

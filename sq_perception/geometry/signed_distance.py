@@ -31,12 +31,6 @@ import numpy as np
 from sq_perception.geometry.kernels import gauge_derivatives, in_object_frame, kernel, support, support_derivatives
 
 _LANES = 64
-_PLANES = 3
-"""Planes a point: at itself and at two feet."""
-_TINY = 1e-24
-"""Added to a squared gradient, which is 0 in the centre alone."""
-_NO_NORMAL = 1e11
-"""1 / |grad g|, metres, above which there is no normal: in the centre."""
 _OF_COVARIANCE = 11
 
 
@@ -93,7 +87,7 @@ def _nearest(
     for first in range(0, n, _LANES):
         count = min(_LANES, n - first)
         for k in range(numbers.shape[0]):
-            _bounded(points, first, count, numbers[k], turns[k], best, normal)
+            _bound(points, first, count, numbers[k], turns[k], best, normal)
             if k_sigma > 0.0:
                 for i in range(count):
                     n1, n2, n3 = normal[0, i], normal[1, i], normal[2, i]
@@ -110,7 +104,7 @@ def _nearest(
 
 
 @kernel
-def _bounded(
+def _bound(
     points: np.ndarray, first: int, count: int, body: np.ndarray, m: np.ndarray, best: np.ndarray, normal: np.ndarray
 ) -> None:
     """Write the bound for up to 64 points from ``first``, and the normal of its plane in the object's frame."""
@@ -136,15 +130,18 @@ def _bounded(
         last = 1.0 if (w == face) & (u != face) & (v != face) else 0.0
         normal[2, i] = math.copysign(ow * scale if is_out else last, z)
     g, reach = np.empty((3, _LANES)), np.empty(_LANES)
-    for _ in range(_PLANES):
+    # Planes a point: at itself and at two feet.
+    for _ in range(3):
         for i in range(_LANES):
             x, y, z = foot[0, i], foot[1, i], foot[2, i]
             _, gx, gy, gz, _, _, _, _ = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, k1, k2)
-            scale = 1.0 / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+            # Added to a squared gradient, which is 0 in the centre alone.
+            scale = 1.0 / math.sqrt(gx * gx + gy * gy + gz * gz + 1e-24)
             g[0, i], g[1, i], g[2, i], reach[i] = gx * scale, gy * scale, gz * scale, scale
         if k1 != 0.0 or k2 != 0.0:
             for i in range(count):
-                if reach[i] < _NO_NORMAL:
+                # 1 / |grad g|, metres, above which there is no normal: in the centre.
+                if reach[i] < 1e11:
                     reach[i] = support(g[0, i], g[1, i], g[2, i], a1, a2, a3, e1, e2, k1, k2)
         for i in range(_LANES):
             gx, gy, gz = g[0, i], g[1, i], g[2, i]

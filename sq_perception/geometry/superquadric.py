@@ -44,17 +44,13 @@ import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, checked_turn, floating, one_body
+from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, check_turn, floating, one_body
 
 Array = Any
 """A NumPy array or a torch tensor."""
 
 FLAT_LENGTH, NUMBERS = 12, 14
 """Numbers of a body without and with its taper."""
-_SCAN, _SECTIONS, _GOLDEN = 25, 45, 0.618033988749895
-"""Points of a tapered body's profile from which its support is sought, golden sections of that, and their ratio."""
-_LEAST_COSINE = 1e-12
-"""Least sine and cosine of a point on a profile: the derivatives of their powers stay finite."""
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
 _ENDS = np.array([1.0, -1.0, -1.0, 1.0])
@@ -112,7 +108,7 @@ class Superquadric:
         if tensors[0]:
             self.__dict__["taper"] = taper
             return
-        parts[3] = checked_turn(parts)
+        parts[3] = check_turn(parts)
         batch = np.broadcast_shapes(*{part.shape[:-1] for part in parts})
         for (name, length), part in zip(LENGTHS.items(), parts, strict=True):
             shown = part.view() if part.shape[:-1] == batch else np.broadcast_to(part, (*batch, length))
@@ -442,33 +438,31 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
     norm of (a1 f1 n_x, a2 f2 n_y).  Along the profile, t = +-sin^e1(w) and sigma = cos^e1(w), octahedra have several
     maxima: the best of some points is followed by golden sections.
 
-    Parameters
-    ----------
-    q : (..., N, 3)
-        a |n|, n the direction in the object's frame.
-    along : (..., N)
-        n_z a3.
-    conjugate : (..., 1, 2)
-        2 - e.
-    taper : (..., 1, 2)
+    q: (..., N, 3), a |n|, n the direction in the object's frame.
+    along: (..., N), n_z a3.
+    conjugate: (..., 1, 2), 2 - e.
+    taper: (..., 1, 2).
     """
+    least = 1e-12  # least sine and cosine of a point on a profile: the derivatives of their powers stay finite
+    # Points of a tapered body's profile from which its support is sought, golden sections of that, and their ratio.
+    scan, sections, golden = 25, 45, 0.618033988749895
     xp = array_namespace(q)
     e1, e2 = 2 - conjugate[..., 0], conjugate[..., 1]
 
     def at(w: Array) -> Array:
         """The support by one point of the profile."""
-        sine, cosine = xp.abs(xp.sin(w)), xp.clip(xp.cos(w), min=_LEAST_COSINE)
-        t = xp.sign(w) * xp.clip(sine, min=_LEAST_COSINE) ** e1 * (sine > 0)
+        sine, cosine = xp.abs(xp.sin(w)), xp.clip(xp.cos(w), min=least)
+        t = xp.sign(w) * xp.clip(sine, min=least) ** e1 * (sine > 0)
         u, v = q[..., 0] * (1 + taper[..., 0] * t), q[..., 1] * (1 + taper[..., 1] * t)
         return along * t + cosine**e1 * p_norm(u, v, e2)
 
-    step = math.pi / (_SCAN - 1)
+    step = math.pi / (scan - 1)
     still = 0 * (along + q[..., 0] + taper[..., 0])
-    values = xp.stack([at(k * step - math.pi / 2 + still) for k in range(_SCAN)], axis=-1)
+    values = xp.stack([at(k * step - math.pi / 2 + still) for k in range(scan)], axis=-1)
     low = (xp.argmax(values, axis=-1) - 1) * step - math.pi / 2 + still
     high = low + 2 * step
-    for _ in range(_SECTIONS):
-        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+    for _ in range(sections):
+        left, right = high - golden * (high - low), low + golden * (high - low)
         falls = at(left) > at(right)
         low, high = xp.where(falls, low, left), xp.where(falls, right, high)
     return xp.maximum(at((low + high) / 2), xp.max(values, axis=-1))

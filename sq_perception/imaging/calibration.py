@@ -42,8 +42,6 @@ from sq_perception.imaging.rectification import Rectification, rectification
 
 Treatment = Literal["auto", "apply", "ignore"]
 
-_NEGLIGIBLE = 1e-9
-"""A coefficient up to it counts as 0: a millionth of a pixel."""
 _WORDS = re.compile(r"[^0-9a-z]+")
 _RECTIFIED = re.compile(r"rect(ified)?")
 
@@ -65,14 +63,9 @@ class Calibration:
 
         Quick: tables are computed for the first image, and calibrations that are equal share them.
 
-        Parameters
-        ----------
-        info
-            Anything with the fields of sensor_msgs/CameraInfo.
-        name
-            Topic of the images, as it is after remapping, or the path of a file.
-        distortion
-            See the module.
+        info: Anything with the fields of sensor_msgs/CameraInfo.
+        name: Topic of the images, as it is after remapping, or the path of a file.
+        distortion: See the module.
 
         Raises ValueError if the camera_info is not usable; the message gives the reason and the setting that might
         help.
@@ -139,7 +132,8 @@ def is_rectified_name(name: str) -> bool:
 
 def is_distorted(coefficients: Sequence[float]) -> bool:
     """Whether distortion coefficients are not all zero; one that is no number counts."""
-    return not all(abs(value) <= _NEGLIGIBLE for value in coefficients)
+    # A coefficient up to it counts as 0: a millionth of a pixel.
+    return not all(abs(value) <= 1e-9 for value in coefficients)
 
 
 def intrinsics(camera: Camera) -> Intrinsics:

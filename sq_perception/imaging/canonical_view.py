@@ -32,7 +32,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera, Lens
-from sq_perception.imaging.lens import point_at
+from sq_perception.imaging.raycast import point_at
 
 MARGIN = 1.06
 """Side of the cube over the side of what is seen in it."""
@@ -48,16 +48,8 @@ NEAREST = 0.5 * (1 + 1 / MARGIN)
 """z0: the value of the object's nearest point."""
 OUTLIERS_PER_END = 1 / 500
 """Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
-_SURROUNDINGS = 1.2
-"""Side of the part of the image that is looked at, in sides of the silhouette's box; more than MARGIN, as under
-perspective the view's edges are not where those of the box are."""
 _NEARER = 0.04
 """Share of the view's side by which something nearer than the object hides what is behind it."""
-_FROM_ABOVE, _LEVEL = 0.2, float(np.cos(np.deg2rad(15.0)))
-"""Least part of a support's normal across the optical axis that tells the roll, 12 degrees; and cosine of a roll that
-counts as none: networks have seen as much."""
-_ROUNDS = 3
-"""Readings of z that settle where a pixel of the view looks."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -137,24 +129,16 @@ def from_mask(
 ) -> CanonicalView:
     """The canonical view of the object under a mask.
 
-    Parameters
-    ----------
-    depth : float (height, width)
-        Metres, NaN where nothing was measured.
-    mask : bool (height, width)
-    camera : Camera
-    pixels : int
-        Side n of the view.
-    find_hidden : bool
-        Whether to look at the object's surroundings for what may hide a part of it.
-    plane : (4,), optional
-        What the object stands on, n.p + d = 0, n up: it tells the camera's roll, and seen in front of the object it
-        hides nothing.
-    missing_is_hidden : bool
-        Whether the object may go on at every pixel without a reading, on it and beside it, and beyond the image; asks
-        for ``find_hidden`` too.  A mask that covers pixels without a reading was not made of readings, and so knows
-        where the object ends: beside such a mask they show nothing of it.  By default a pixel that measured nothing
-        hides something within the object's convex hull only.
+    depth: float (height, width), metres, NaN where nothing was measured.
+    mask: bool (height, width).
+    pixels: Side n of the view.
+    find_hidden: Whether to look at the object's surroundings for what may hide a part of it.
+    plane: (4,), what the object stands on, n.p + d = 0, n up: it tells the camera's roll, and seen in front of the
+        object it hides nothing.
+    missing_is_hidden: Whether the object may go on at every pixel without a reading, on it and beside it, and beyond
+        the image; asks for ``find_hidden`` too.  A mask that covers pixels without a reading was not made of readings,
+        and so knows where the object ends: beside such a mask they show nothing of it.  By default a pixel that
+        measured nothing hides something within the object's convex hull only.
 
     Raises ValueError if the images do not fit the camera, or no pixel of the mask has a depth.
     """
@@ -203,12 +187,8 @@ def from_mask(
 def full_frame(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int) -> CanonicalView:
     """The object in the whole unit cube, uncropped, as in the thesis' images: pixels at column / (n - 1).
 
-    Parameters
-    ----------
-    depth, mask, pixels
-        As in :func:`from_mask`.
-    camera : Camera
-        Orthographic, of the unit cube (:mod:`sq_perception.imaging.unit_cube`).
+    depth, mask, pixels: As in :func:`from_mask`.
+    camera: Orthographic, of the unit cube (:mod:`sq_perception.imaging.unit_cube`).
 
     Raises ValueError for a pinhole camera, or images that do not fit the camera.
     """
@@ -231,7 +211,9 @@ def upright(normal: np.ndarray) -> np.ndarray:
     """The rotation (3, 3) about the optical axis that undoes a camera's roll, by the support's normal (3,), upwards."""
     x, y, _ = normal
     across = float(np.hypot(x, y))
-    if across < _FROM_ABOVE or -y > _LEVEL * across:
+    # Least part of a support's normal across the optical axis that tells the roll, 12 degrees; and cosine of a roll
+    # that counts as none: networks have seen as much.
+    if across < 0.2 or -y > float(np.cos(np.deg2rad(15.0))) * across:
         return np.eye(3)
     c, s = -y / across, x / across
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -250,7 +232,9 @@ def _with_surroundings(
 ) -> tuple[int, int, int, int]:
     """The part of the image, as a box, that a square view of a box of pixels shows; ``wider`` as by
     :func:`_looking_at`."""
-    side = _SURROUNDINGS * wider * max(width, height)
+    # Side of the part of the image that is looked at, in sides of the silhouette's box; more than MARGIN, as under
+    # perspective the view's edges are not where those of the box are.
+    side = 1.2 * wider * max(width, height)
     right, bottom = left + width, top + height
     beside, above = int(np.ceil(0.5 * (side - width))) + 1, int(np.ceil(0.5 * (side - height))) + 1
     left, top = max(0, left - beside), max(0, top - above)
@@ -278,11 +262,7 @@ def _within_hull(mask: np.ndarray) -> np.ndarray:
 
 @kernel
 def _rotate(
-    depth: np.ndarray,
-    mask: np.ndarray,
-    unread: float,
-    lens: Lens,
-    matrix: np.ndarray,
+    depth: np.ndarray, mask: np.ndarray, unread: float, lens: Lens, matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere.
 
@@ -357,6 +337,7 @@ def _resample(
     ``whole`` is left, top, right and bottom of the whole image in the crop: beyond it the object may go on.  Where it
     is empty, that is not asked.
     """
+    rounds = 3  # readings of z that settle where a pixel of the view looks
     fx, fy, cx, cy, pinhole = lens
     height, width = image.shape
     left, top, right, bottom = whole
@@ -365,7 +346,7 @@ def _resample(
     for i in range(pixels):
         y = anchor[1] - ((i + 0.5) / pixels - 0.5) * extent
         z[:] = z_guess
-        for step in range(_ROUNDS + 1):
+        for step in range(rounds + 1):
             for j in range(pixels):  # without a branch: vector code
                 x = anchor[0] + ((j + 0.5) / pixels - 0.5) * extent
                 px = x * matrix[0, 0] + y * matrix[1, 0] + z[j] * matrix[2, 0]
@@ -375,7 +356,7 @@ def _resample(
                 ahead = pz > 0 or not pinhole
                 us[j] = np.rint(fx * px * scale + cx) if ahead else np.inf
                 vs[j] = np.rint(fy * py * scale + cy) if ahead else np.inf
-            if not pinhole or step == _ROUNDS:
+            if not pinhole or step == rounds:
                 break
             for j in range(pixels):
                 z[j] = filled[int(min(max(vs[j], 0), height - 1)), int(min(max(us[j], 0), width - 1))]

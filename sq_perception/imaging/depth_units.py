@@ -35,17 +35,8 @@ DepthKind = Literal["z", "range"]
 """What a depth image holds: z along the optical axis, or the distance to the camera's centre along each ray."""
 MILLIMETRES = 1000.0
 """Units a metre."""
-_MOST_METRES_A_UNIT, _MOST_MILLIMETRES_A_UNIT = 0.005, 50.0
-"""A stated depth_scale up to the first is metres a unit (librealsense: 0.001, 0.000125), up to the second millimetres a
-unit (BOP: 0.1, 1), beyond it units a metre (TUM: 5000): no known one is within a factor of 2 of either."""
-_MANY, _LEAST = 1e-4, 10
-"""Share of an image's pixels, and their number, that stray readings do not reach."""
-_BEYOND = 1.2
-"""Ratio of a mark to the readings before it."""
 _STRAYS = 0.01
 """Share of the readings that may lie in between, as where an image was scaled down."""
-_HOLES = 0.1
-"""Share of a mark's pixels in holes, which have readings all around."""
 _NO_DISPARITY, _DISPARITIES = 2047, (300, 1090)
 """Raw numbers of a Kinect: nothing measured; from half a metre to ten metres."""
 
@@ -79,9 +70,12 @@ def parse_scale(value: float, where: str) -> Stated:
     """The unit of a ``depth_scale``, whose convention shows in its magnitude; ValueError unless it is positive."""
     if not 0 < value < math.inf:
         raise ValueError(f"{where}: expected a positive number, got {value:g}")
-    if value <= _MOST_METRES_A_UNIT:
+    # A stated depth_scale up to the first is metres a unit (librealsense: 0.001, 0.000125), up to the second
+    # millimetres a unit (BOP: 0.1, 1), beyond it units a metre (TUM: 5000): no known one is within a factor of 2 of
+    # either.
+    if value <= 0.005:
         return Stated(1 / value, f"{where} = {value:g} (metres a unit)")
-    if value <= _MOST_MILLIMETRES_A_UNIT:
+    if value <= 50.0:
         return Stated(MILLIMETRES / value, f"{where} = {value:g} (millimetres a unit)")
     return Stated(value, f"{where} = {value:g} (units a metre)")
 
@@ -89,13 +83,8 @@ def parse_scale(value: float, where: str) -> Stated:
 def metres(numbers: np.ndarray, scale: float | None = None, known: Stated | None = None) -> Metres:
     """Depth of the numbers (height, width) of an image, of any real type and byte order.
 
-    Parameters
-    ----------
-    numbers
-    scale
-        Units a metre that the caller asks for: goes before all else.
-    known
-        What is stated beside the image; of floats it only counts where they can hardly be metres.
+    scale: Units a metre that the caller asks for: goes before all else.
+    known: What is stated beside the image; of floats it only counts where they can hardly be metres.
 
     Raises UnitsError for raw disparities.
     """
@@ -154,10 +143,12 @@ def _mark(depth: np.ndarray, scale: float) -> float | None:
     top = np.fmax.reduce(depth, axis=None)
     held = depth == top
     count = np.count_nonzero(held)
-    if count < max(_MANY * depth.size, _LEAST):  # of NaN, too
+    # Share of an image's pixels, and their number, that stray readings do not reach.
+    if count < max(1e-4 * depth.size, 10):  # of NaN, too
         return None
     others = depth[depth < top]
-    if np.count_nonzero(others > top / _BEYOND) > _STRAYS * others.size or not others.size:
+    # Ratio of a mark to the readings before it.
+    if np.count_nonzero(others > top / 1.2) > _STRAYS * others.size or not others.size:
         return None
     if any(_is_code(float(top) * unit) for unit in (scale, MILLIMETRES)):
         return float(top)
@@ -165,7 +156,8 @@ def _mark(depth: np.ndarray, scale: float) -> float | None:
     _, parts, boxes, _ = cv2.connectedComponentsWithStats(none, connectivity=4)
     left, upper, width, height, _ = boxes.T
     is_hole = (left > 0) & (upper > 0) & (left + width < depth.shape[1]) & (upper + height < depth.shape[0])
-    return float(top) if np.count_nonzero(is_hole[parts[held]]) >= _HOLES * count else None
+    # Share of a mark's pixels in holes, which have readings all around.
+    return float(top) if np.count_nonzero(is_hole[parts[held]]) >= 0.1 * count else None
 
 
 def _is_code(value: float) -> bool:

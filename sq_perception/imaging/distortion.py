@@ -36,28 +36,14 @@ FISHEYE = "equidistant"
 POLYNOMIAL = ("plumb_bob", "rational_polynomial")
 MODELS = (*POLYNOMIAL, FISHEYE)
 
-_LENGTHS = {**dict.fromkeys(POLYNOMIAL, (4, 5, 8, 12, 14)), FISHEYE: (4,)}
-_LARGEST = 1e6
-"""The largest coefficient; whatever is larger is no lens."""
-_WIDEST = math.pi / 2 - 1e-3
-_SAMPLES = 4096
-_STEPS = 20
-_EXACT = 1e-13
-"""Tolerance of the place of an image: a ten-thousandth of a millionth of a pixel."""
-_NEAR_AXIS = 1e-6
-"""s below which the fisheye's q is its series."""
 
 
 @dataclass(frozen=True)
 class Distortion:
     """One lens; see the module for the equations.
 
-    Parameters
-    ----------
-    model
-        One of ``MODELS``.
-    coefficients
-        In OpenCV's order.  As for OpenCV, their number determines the terms, for plumb_bob and
+    model: One of ``MODELS``.
+    coefficients: In OpenCV's order.  As for OpenCV, their number determines the terms, for plumb_bob and
         rational_polynomial alike: 4, 5, 8, or 12 and 14 where thin prism and tilt are zero.
 
     Raises ValueError for another model, another number of coefficients, a coefficient that is not finite or absurdly
@@ -68,17 +54,18 @@ class Distortion:
     coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
+        largest = 1e6  # the largest coefficient; whatever is larger is no lens
         if self.model not in MODELS:
             raise ValueError(f"distortion_model: expected {', '.join(MODELS)}, got {self.model!r}")
         given: Sequence[float] = self.coefficients
         coefficients = tuple(float(value) for value in given)
-        lengths = _LENGTHS[self.model]
+        lengths = {**dict.fromkeys(POLYNOMIAL, (4, 5, 8, 12, 14)), FISHEYE: (4,)}[self.model]
         if len(coefficients) not in lengths:
             expected = " or ".join(map(str, lengths))
             raise ValueError(f"distortion {self.model}: expected {expected} coefficients, got {len(coefficients)}")
-        if not all(abs(value) <= _LARGEST for value in coefficients):
+        if not all(abs(value) <= largest for value in coefficients):
             numbers = " ".join(f"{value:g}" for value in coefficients)
-            raise ValueError(f"distortion {self.model}: expected finite coefficients up to {_LARGEST:g}, got {numbers}")
+            raise ValueError(f"distortion {self.model}: expected finite coefficients up to {largest:g}, got {numbers}")
         if self.model in POLYNOMIAL and any(coefficients[8:]):
             raise ValueError(f"distortion {self.model}: thin prism and tilt (coefficients 9 to 14) are not supported")
         object.__setattr__(self, "coefficients", coefficients)
@@ -97,6 +84,7 @@ class Distortion:
 
     def inverse(self, images: np.ndarray) -> np.ndarray:
         """Rays (..., 2) of images at (..., 2); NaN where no ray has its image."""
+        exact = 1e-13  # tolerance of the place of an image: a ten-thousandth of a millionth of a pixel
         images = np.asarray(images, dtype=float)
         if self.model != "equidistant" and not any(self.coefficients):
             return images.copy()
@@ -106,17 +94,17 @@ class Distortion:
             radius = np.hypot(flat[:, 0], flat[:, 1])
             start = np.where(radius > 0, np.interp(radius, reached, table) / radius, 1.0)
             x, y = flat[:, 0] * start, flat[:, 1] * start
-            for _ in range(_STEPS):
+            for _ in range(20):
                 image_x, image_y, (xx, xy, yy) = self._map(x, y)
                 miss_x, miss_y = flat[:, 0] - image_x, flat[:, 1] - image_y
                 # Relative: the farther out, the larger the numbers.
-                if not (np.abs(miss_x) + np.abs(miss_y) > _EXACT * (1 + radius)).any():
+                if not (np.abs(miss_x) + np.abs(miss_y) > exact * (1 + radius)).any():
                     break
                 det = xx * yy - xy * xy
                 x, y = x + (yy * miss_x - xy * miss_y) / det, y + (xx * miss_y - xy * miss_x) / det
             rays = np.stack([x, y], axis=-1)
             wrong = np.abs(self.forward(rays) - flat).sum(axis=-1)
-            rays[~(wrong <= 100 * _EXACT * (1 + radius))] = np.nan
+            rays[~(wrong <= 100 * exact * (1 + radius))] = np.nan
         return rays.reshape(images.shape)
 
     def _map(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
@@ -148,7 +136,8 @@ class Distortion:
         t = theta * theta
         turned = theta * (1 + t * (k1 + t * (k2 + t * (k3 + t * k4))))
         rate = (1 + t * (3 * k1 + t * (5 * k2 + t * (7 * k3 + 9 * k4 * t)))) / (1 + s)
-        near = s < _NEAR_AXIS
+        # s below which the fisheye's q is its series.
+        near = s < 1e-6
         safe = np.where(near, 1.0, r)
         q = np.where(near, 1 + (k1 - 1 / 3) * s, turned / safe)
         return q, np.where(near, k1 - 1 / 3, (rate - q) / (2 * safe * safe))
@@ -156,9 +145,10 @@ class Distortion:
     @cached_property
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
         """Radii r of rays and r' of their images, tangential part left out, both rising, up to where r' turns back."""
-        radius = np.tan(np.linspace(0.0, _WIDEST, _SAMPLES))
+        samples = 4096
+        radius = np.tan(np.linspace(0.0, (math.pi / 2 - 1e-3), samples))
         with np.errstate(all="ignore"):
             reached = radius * self._radial(radius * radius)[0]
             back = np.flatnonzero(~(np.diff(reached) > 0))
-        count = int(back[0]) + 1 if back.size else _SAMPLES
+        count = int(back[0]) + 1 if back.size else samples
         return radius[:count], reached[:count]

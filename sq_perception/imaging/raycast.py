@@ -8,14 +8,17 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import in_object_frame, inside_box, parallel_kernel, ray_entry
+from sq_perception.geometry.kernels import (
+    Triple,
+    in_object_frame,
+    inline_kernel,
+    inside_box,
+    kernel,
+    parallel_kernel,
+    ray_entry,
+)
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera, Lens
-
-_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
-"""Corners of a box: which of its lower and upper x, y and z each is at."""
-_NEAR = 1e-6
-"""Depth before a pinhole camera, metres, below which a corner says nothing of where a thing is seen."""
 
 
 def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +52,8 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
     flat = np.ascontiguousarray(bodies.to_numbers(), dtype=float)
     boxes = Superquadric.from_flat(flat).untapered().bounding_box()  # closed form, and hardly larger
-    corners = np.stack(boxes, axis=1)[:, _CORNERS, [0, 1, 2]]
+    # Corners of a box: which of its lower and upper x, y and z each is at.
+    corners = np.stack(boxes, axis=1)[:, np.indices((2, 2, 2)).reshape(3, 8).T, [0, 1, 2]]
     _render_bodies(flat, matrices, windows(corners, camera), camera.lens, depth, index)
     return depth, index
 
@@ -65,7 +69,8 @@ def windows(corners: np.ndarray, camera: Camera) -> np.ndarray:
     first, last = np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1
     if camera.is_pinhole:
         z = corners[..., 2]
-        reaches_behind = z.min(axis=1) <= _NEAR
+        # Depth before a pinhole camera, metres, below which a corner says nothing of where a thing is seen.
+        reaches_behind = z.min(axis=1) <= 1e-6
         first[reaches_behind], last[reaches_behind] = 0, size
         last[z.max(axis=1) <= 0] = 0
     return np.clip(np.concatenate([first, last], axis=1), 0, [*size, *size]).astype(np.int64)
@@ -73,12 +78,7 @@ def windows(corners: np.ndarray, camera: Camera) -> np.ndarray:
 
 @parallel_kernel
 def _render_bodies(
-    flat: np.ndarray,
-    matrices: np.ndarray,
-    windows: np.ndarray,
-    lens: Lens,
-    depth: np.ndarray,
-    index: np.ndarray,
+    flat: np.ndarray, matrices: np.ndarray, windows: np.ndarray, lens: Lens, depth: np.ndarray, index: np.ndarray
 ) -> None:
     fx, fy, cx, cy, pinhole = lens
     for v in numba.prange(depth.shape[0]):
@@ -104,3 +104,22 @@ def _render_bodies(
                 if hit and t < depth[v, u] and (t > 0.0 or not pinhole):
                     depth[v, u] = t
                     index[v, u] = k
+
+
+@inline_kernel
+def point_at(u: int, v: int, z: float, lens: Lens) -> Triple:
+    """The point that a pixel sees at a depth."""
+    scale = z if lens.is_pinhole else 1.0
+    return (u - lens.cx) / lens.fx * scale, (v - lens.cy) / lens.fy * scale, z
+
+
+@kernel
+def heights(depth: np.ndarray, mask: np.ndarray, lens: Lens, plane: np.ndarray) -> np.ndarray:
+    """Heights (h, w) above a plane (4,) of what the pixels of a mask (h, w) see, by their depths; NaN elsewhere."""
+    found = np.full(depth.shape, np.nan)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if mask[v, u]:
+                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
+                found[v, u] = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
+    return found

@@ -42,17 +42,8 @@ from sq_perception.imaging.distortion import Distortion
 
 LARGEST_SIDE = 2**15 - 2
 """Largest side of an image that OpenCV can look up, pixels."""
-_KEPT = 16
-"""Calibrations whose tables are kept."""
-_GROWTH = 2.0
-"""Factor by which the number of pixels grows, at most."""
-_BORDER = 64
-"""Places on each side of the raw image whose rays bound what it sees."""
 _STEEPEST = 10.0
 """Tangent of the incidence beyond which a step between neighbours is a jump."""
-_CLOSE = 0.01
-"""Distance of two places that are as good as one, pixels."""
-_SQUARE = np.ones((2, 2), np.uint8)
 _OUTSIDE = -9.0
 """A column and row that no image has."""
 
@@ -61,11 +52,7 @@ _OUTSIDE = -9.0
 class Rectification:
     """From a raw camera to the pinhole camera in its place; :func:`rectification` gives one whose tables are kept.
 
-    Parameters
-    ----------
-    raw : Camera
-        Size and intrinsics (K) of the raw images; pinhole.
-    distortion : Distortion
+    raw: Size and intrinsics (K) of the raw images; pinhole.
 
     Raises ValueError if the camera is no pinhole, its images are too large, or the distortion cannot be undone in the
     middle of it.
@@ -104,7 +91,8 @@ class Rectification:
         return Lookup.of(_pixels(self.camera, self.distortion.inverse(images)), self.camera)
 
 
-@lru_cache(maxsize=_KEPT)
+@lru_cache(maxsize=16)
+# Calibrations whose tables are kept.
 def rectification(raw: Camera, distortion: Distortion) -> Rectification:
     """The rectification of this calibration: equal calibrations share one, and its tables.
 
@@ -136,7 +124,8 @@ class Lookup:
         left, top = np.floor(u), np.floor(v)
         off = np.maximum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v)))
         step = math.sqrt(2.0) * _STEEPEST / min(source.fx, source.fy)
-        return cls(source, u, v, left, top, (off <= _CLOSE).view(np.uint8), min(step, 0.5))
+        # Distance of two places that are as good as one, pixels.
+        return cls(source, u, v, left, top, (off <= 0.01).view(np.uint8), min(step, 0.5))
 
     def depth(self, image: np.ndarray) -> np.ndarray:
         """The depth image, float32 in metres, from one of the source: positive, NaN or +inf where there is nothing.
@@ -152,7 +141,7 @@ class Lookup:
             closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, depth_steps.CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
             # Extremes over each pixel and its neighbours to the right, below, and across.
-            least, most = (find(inverse, _SQUARE, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
+            least, most = (find(inverse, np.ones((2, 2), np.uint8), anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
             smooth: np.ndarray = (least > np.float32(1 - self.step) * most).view(np.uint8)
             smooth[-1], smooth[:, -1] = 0, 0
             smooth = cv2.remap(smooth, self.left, self.top, cv2.INTER_NEAREST, borderValue=0)
@@ -188,8 +177,9 @@ def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
 
 def _window(raw: Camera, distortion: Distortion) -> tuple[int, int, int, int]:
     """First and last column and row (left, top, right, bottom) of the pinhole image, on the grid of the raw one."""
+    places = 64  # places on each side of the raw image whose rays bound what it sees
     width, height = float(raw.width), float(raw.height)
-    across, down = np.linspace(0, width - 1, _BORDER), np.linspace(0, height - 1, _BORDER)
+    across, down = np.linspace(0, width - 1, places), np.linspace(0, height - 1, places)
     ends = np.array([0.0, 1.0])
     sides = _rays(raw, across, ends * (height - 1)), _rays(raw, ends * (width - 1), down)
     border = np.concatenate([_pixels(raw, distortion.inverse(side)).reshape(-1, 2) for side in sides])
@@ -205,7 +195,8 @@ def _window(raw: Camera, distortion: Distortion) -> tuple[int, int, int, int]:
     size = np.array([width, height])
     before, after = np.clip(centre - low, 0, 2 * size), np.clip(high - centre, 0, 2 * size)
     area = np.prod(before + after + 1)
-    scale = min(1.0, math.sqrt(_GROWTH * width * height / area))
+    # Factor by which the number of pixels grows, at most.
+    scale = min(1.0, math.sqrt(2.0 * width * height / area))
     # A border that hits the grid must not gain a pixel by rounding.
     left, top = np.floor(centre - scale * before + 1e-6).astype(int)
     right, bottom = np.ceil(centre + scale * after - 1e-6).astype(int)

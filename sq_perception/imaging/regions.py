@@ -9,10 +9,6 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
-_BAND = 0.1
-"""Share of a side of an image: the most of it that a band without readings takes along a border; beyond more there is
-nothing to measure.  That of a D435 takes so much of what is 0.25 m away.  Chosen."""
-
 
 def nearest(wanted: np.ndarray) -> np.ndarray:
     """For each pixel (height, width), the index into the flat image of the nearest pixel that is set in ``wanted``.
@@ -74,9 +70,12 @@ def fills(mask_box: tuple[int, int, int, int], measured: np.ndarray) -> bool:
 
     Readings need not reach the border of the image, as those of a rectified one and of a stereo camera do not.
     """
+    # Share of a side of an image: the most of it that a band without readings takes along a border; beyond more there
+    # is nothing to measure. That of a D435 takes so much of what is 0.25 m away. Chosen.
+    band = 0.1
     (left, top, wide, high), (rows, columns) = mask_box, measured.shape
-    across = left <= _BAND * columns and left + wide >= (1 - _BAND) * columns
-    down = top <= _BAND * rows and top + high >= (1 - _BAND) * rows
+    across = left <= band * columns and left + wide >= (1 - band) * columns
+    down = top <= band * rows and top + high >= (1 - band) * rows
     if not (across or down):
         return False
     first_column, first_row, width, height = box(measured)
@@ -134,14 +133,9 @@ def borders(
     """How often each two of the labels 0 to ``count`` are next to each other along the rows and the columns of an
     image, across pixels without a depth (0); the image's border is of label 0.
 
-    Returns
-    -------
-    met : (count + 1, count + 1)
-        Number of all of these contacts.
-    beside
-        Number of those at which the two are less than ``near`` metres apart along the line of sight; 0 for label 0.
-    behind
-        Number of those at which a (row) is farther than b (column) by a depth step, and by less than ``far`` metres.
+    Returns three numbers of contacts (count + 1, count + 1): of all; of those at which the two are less than ``near``
+    metres apart along the line of sight, 0 for label 0; of those at which a (row) is farther than b (column) by a depth
+    step, and by less than ``far`` metres.
     """
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near, far)

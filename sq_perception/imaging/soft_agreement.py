@@ -30,12 +30,7 @@ _AT_ONCE = 16
 
 @kernel
 def agreement(
-    image: np.ndarray,
-    stride: int,
-    parameters: np.ndarray,
-    rotation: np.ndarray,
-    sharpness: float,
-    tau: float,
+    image: np.ndarray, stride: int, parameters: np.ndarray, rotation: np.ndarray, sharpness: float, tau: float
 ) -> float:
     """Intersection over union of what the view and the body show, at every ``stride``-th row and column.
 

@@ -6,19 +6,17 @@ The header (strings, as the format demands) holds ``format`` and its version, th
 training noted (``training``, ``metrics``: JSON).  Reading executes nothing, and every name and shape must fit.
 Half precision on disk halves the file; networks compute in single precision.
 
-A file is taken in as a whole and never mapped: one that is cut short or replaced while it is read, or afterwards, is
-an error or another network, and no fault of memory that ends the process.  No header makes
-anything be allocated: the file's own length bounds it, and that is looked at first.
+Weights are taken in as a whole and never mapped: a file that is cut short or replaced while they are read, or
+afterwards, is an error or another network, and no fault of memory that ends the process.  No header makes anything be
+allocated: the file's own length bounds it, and that is looked at first.
 
-Reference: the safetensors format, https://huggingface.co/docs/safetensors: 8 bytes little endian, length of the header;
-the header, JSON; the tensors, as one block that the header's offsets cover without gap or overlap.
+Reference: the safetensors format, https://huggingface.co/docs/safetensors.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import struct
 from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import resources
@@ -26,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load as arrays_of
 from safetensors.numpy import save as bytes_of
 
@@ -49,10 +47,6 @@ _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things
 """Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
-_MAX_HEADER_BYTES = 2**20
-_LENGTH = struct.Struct("<Q")
-_MAX_BLOCKS = 64
-_MAX_PIXELS = 1024
 
 
 class CheckpointError(ValueError):
@@ -138,11 +132,10 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
     its own config.
     """
     path = resolve(_SHIPPED[kind] if path is None else path)
-    data, _ = _bytes(path)
-    config = _parse_config(path, _strings(path, data, len(data)), kind)
+    config = _parse_config(path, read_header(path), kind)
     try:
-        stored = arrays_of(data)
-    except (SafetensorError, ValueError, KeyError) as error:
+        stored = arrays_of(path.read_bytes())
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
     expected = layout.shapes(config)
     found = {name: array for name, array in stored.items() if not name.endswith(layout.COUNTER)}
@@ -162,8 +155,12 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
 def read_header(path: Path | str | None = None) -> dict[str, str]:
     """The header's strings alone; raises CheckpointError as :func:`load` does, but looks at no weights."""
     path = resolve(path)
-    data, size = _bytes(path, header_only=True)
-    return _strings(path, data, size)
+    _check_size(path)
+    try:
+        with safe_open(path, "np") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
 
 
 def predicts_hulls(path: Path | str | None = None) -> bool:
@@ -172,52 +169,22 @@ def predicts_hulls(path: Path | str | None = None) -> bool:
 
 
 def check(path: Path | str | None = None) -> None:
-    """Raise CheckpointError where :func:`load` or :func:`load_things` would because of the header.
-
-    Reads a megabyte at most, whatever the file.
-    """
+    """Raise CheckpointError where :func:`load` or :func:`load_things` would because of the header."""
     path = resolve(path)
     header = read_header(path)
     kind: type[Any] = ThingConfig if header.get("format") == THING_FORMAT else RegressorConfig
     _parse_config(path, header, kind)
 
 
-def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:
-    """What the file holds, or no more than its header, and how many bytes it has."""
+def _check_size(path: Path) -> None:
+    """Raise CheckpointError for a file that is not there, or larger than those of networks."""
     try:
         if not path.is_file():
             raise CheckpointError(f"{path}: no such model file")
-        with path.open("rb") as file:
-            size = path.stat().st_size
-            if size > _MAX_BYTES:
-                raise CheckpointError(f"{path}: expected at most {_MAX_BYTES} bytes, got {size}")
-            start = file.read(_LENGTH.size)
-            length = _LENGTH.unpack(start)[0] if len(start) == _LENGTH.size else 0
-            if not 0 < length <= min(_MAX_HEADER_BYTES, size - _LENGTH.size):
-                raise CheckpointError(
-                    f"{path}: not a readable safetensors file: a header of {length} bytes in a file of {size}"
-                )
-            return start + file.read(length if header_only else size - _LENGTH.size), size
+        if path.stat().st_size > _MAX_BYTES:
+            raise CheckpointError(f"{path}: expected at most {_MAX_BYTES} bytes, got {path.stat().st_size}")
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read: {error}") from error
-
-
-def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
-    """The header's strings; ``size`` bytes must be what its tensors cover."""
-    length = _LENGTH.unpack_from(data)[0]
-    try:
-        header = json.loads(data[_LENGTH.size : _LENGTH.size + length])
-        strings = header.pop("__metadata__", None) or {}
-        end = max((int(one["data_offsets"][1]) for one in header.values()), default=0)
-        strings = {str(key): str(value) for key, value in strings.items()}
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
-        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
-    if _LENGTH.size + length + end != size:
-        raise CheckpointError(
-            f"{path}: not a readable safetensors file: its header covers {_LENGTH.size + length + end} bytes, "
-            f"the file has {size}"
-        )
-    return strings
 
 
 def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
@@ -225,6 +192,8 @@ def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Con
 
     Raises CheckpointError if it describes none.
     """
+    most_pixels = 1024
+    most_blocks = 64
     if header.get("format") != _FORMATS[kind]:
         raise CheckpointError(f"{path}: expected a header 'format: {_FORMATS[kind]}', got {header.get('format')!r}")
     if header.get("version") != VERSION:
@@ -233,8 +202,8 @@ def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Con
         values: dict[str, Any] = json.loads(header["config"])
         values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
         config = kind(**values)
-        if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
-            raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
+        if config.pixels > most_pixels or config.blocks > most_blocks:
+            raise ValueError(f"expected at most {most_pixels} pixels and {most_blocks} blocks a stage")
         if sum(math.prod(shape) for shape in layout.shapes(config).values()) > _MAX_PARAMETERS:
             raise ValueError("the network would be larger than any this package trains")
     except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:

@@ -28,20 +28,11 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 Weights = Mapping[str, np.ndarray]
 """float32, by the names of :mod:`sq_perception.learning.layout`."""
 
-_EPSILON = 1e-5
-"""What torch's normalisations add to a variance."""
 _G = {
     4: np.array([[2, 0, 0], [1, 1, 1], [1, -1, 1], [0, 0, 2]]) / 2,
     6: np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]]) / 24,
 }
-_FEW = 16
-"""Channels: up to here tiles take longer to write than products of matrices; views of 32 x 32 pixels take 0.4 of it."""
-_WIDE = 256
-"""Channels: here tiles of 4 x 4 are taken, as to read matrices of those of 6 x 6 takes longer than they save."""
 _ZERO, _2, _4, _5, _8 = (np.float32(number) for number in (0, 2, 4, 5, 8))
-_CACHED, _FEWEST_ROWS = 130_000, 160
-"""Numbers that stay in a processor's cache between two steps of a layer, and rows of a product that are worth reading
-its matrix: chosen on a cache of 1 MB a core."""
 
 
 class Memory(threading.local):
@@ -77,7 +68,7 @@ class Direct:
     stride: int
 
     @classmethod
-    def folded(cls, weights: Weights, name: str, norm: str, stride: int) -> Direct:
+    def fold(cls, weights: Weights, name: str, norm: str, stride: int) -> Direct:
         kernels, bias = _fold_norm(weights, name, norm)
         matrix = kernels.transpose(2, 3, 1, 0).reshape(-1, kernels.shape[0])
         return cls(contiguous(matrix), bias, kernels.shape[2], stride)
@@ -97,7 +88,7 @@ class Direct:
             np.matmul(windows, self.matrix, out=rows)
         return out
 
-    def computed(
+    def compute(
         self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
     ) -> np.ndarray:
         """Framed images of ``side`` pixels a side; ``skip``, images with that margin, is added to the sums."""
@@ -115,19 +106,20 @@ class _Tiled:
     bias: np.ndarray
 
     @classmethod
-    def folded(cls, weights: Weights, name: str, norm: str) -> _Tiled:
+    def fold(cls, weights: Weights, name: str, norm: str) -> _Tiled:
         kernels, bias = _fold_norm(weights, name, norm)
         inputs = kernels.shape[1]
-        g = _G[4 if inputs >= _WIDE else 6]
+        # Channels: here tiles of 4 x 4 are taken, as to read matrices of those of 6 x 6 takes longer than they save.
+        g = _G[4 if inputs >= 256 else 6]
         # g w g^T of all kernels as one product: a sum over four indices takes thirty times as long, at every start.
         taps = kernels.transpose(2, 3, 1, 0).reshape(g.shape[1] ** 2, -1)
         tiles = np.kron(g, g) @ taps
         return cls(contiguous(tiles.reshape(len(tiles), inputs, -1)), bias)
 
-    def computed(
+    def compute(
         self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
     ) -> np.ndarray:
-        """As :meth:`Direct.computed`."""
+        """As :meth:`Direct.compute`."""
         squares, inputs, outputs = self.matrices.shape
         size = math.isqrt(squares)
         out = memory.framed_images(name, len(x), side, outputs)
@@ -152,35 +144,39 @@ class Block:
     shortcut: Direct | None
 
     @classmethod
-    def folded(cls, weights: Weights, name: str) -> Block:
+    def fold(cls, weights: Weights, name: str) -> Block:
         second = _keep_resolution(weights, f"{name}.second", f"{name}.second_norm")
         if f"{name}.shortcut.0.weight" not in weights:
             return cls(_keep_resolution(weights, f"{name}.first", f"{name}.first_norm"), second, None)
-        shortcut = Direct.folded(weights, f"{name}.shortcut.0", f"{name}.shortcut.1", stride=2)
+        shortcut = Direct.fold(weights, f"{name}.shortcut.0", f"{name}.shortcut.1", stride=2)
         second = replace(second, bias=second.bias + shortcut.bias)
-        return cls(Direct.folded(weights, f"{name}.first", f"{name}.first_norm", stride=2), second, shortcut)
+        return cls(Direct.fold(weights, f"{name}.first", f"{name}.first_norm", stride=2), second, shortcut)
 
-    def computed(self, x: np.ndarray, side: int, memory: Memory, name: str) -> tuple[np.ndarray, int]:
+    def compute(self, x: np.ndarray, side: int, memory: Memory, name: str) -> tuple[np.ndarray, int]:
         """Framed images of framed ones, and their side."""
         if self.shortcut is None:
             skip, margin = x, 1
         else:
             side, margin = side // 2, 0
             skip = self.shortcut.products(x, 1, side, memory, "skip").reshape(len(x), side, side, -1)
-        y = self.first.computed(x, side, memory, f"{name} first")
-        return self.second.computed(y, side, memory, f"{name} second", skip, margin), side
+        y = self.first.compute(x, side, memory, f"{name} first")
+        return self.second.compute(y, side, memory, f"{name} second", skip, margin), side
 
 
 def _keep_resolution(weights: Weights, name: str, norm: str) -> Direct | _Tiled:
     """A convolution that keeps the resolution."""
-    if weights[f"{name}.weight"].shape[1] <= _FEW:
-        return Direct.folded(weights, name, norm, stride=1)
-    return _Tiled.folded(weights, name, norm)
+    # Channels: up to here tiles take longer to write than products of matrices; views of 32 x 32 pixels take 0.4 of it.
+    if weights[f"{name}.weight"].shape[1] <= 16:
+        return Direct.fold(weights, name, norm, stride=1)
+    return _Tiled.fold(weights, name, norm)
 
 
 def _parts(images: int, rows: int, columns: int) -> Iterator[slice]:
     """Slices of some images that go through a layer's product together, each (rows, columns) in it."""
-    at_once = max(1, _CACHED // (rows * columns), _FEWEST_ROWS // rows)
+    # Numbers that stay in a processor's cache between two steps of a layer, and rows of a product that are worth
+    # reading its matrix: chosen on a cache of 1 MB a core.
+    cached, fewest_rows = 130_000, 160
+    at_once = max(1, cached // (rows * columns), fewest_rows // rows)
     return (slice(first, min(first + at_once, images)) for first in range(0, images, at_once))
 
 
@@ -189,7 +185,8 @@ def _fold_norm(weights: Weights, name: str, norm: str) -> tuple[np.ndarray, np.n
     scale, shift, mean, variance = (
         weights[f"{norm}.{part}"].astype(float) for part in ("weight", "bias", "running_mean", "running_var")
     )
-    scale = scale / np.sqrt(variance + _EPSILON)
+    # What torch's normalisations add to a variance.
+    scale = scale / np.sqrt(variance + 1e-5)
     return scale[:, None, None, None] * weights[f"{name}.weight"], (shift - scale * mean).astype(np.float32)
 
 
@@ -218,13 +215,7 @@ def _write_windows(x: np.ndarray, first: int, size: int, stride: int, side: int,
 
 @kernel
 def _write_sums(
-    products: np.ndarray,
-    bias: np.ndarray,
-    skip: np.ndarray,
-    is_added: bool,
-    margin: int,
-    side: int,
-    out: np.ndarray,
+    products: np.ndarray, bias: np.ndarray, skip: np.ndarray, is_added: bool, margin: int, side: int, out: np.ndarray
 ) -> None:
     """max(0, product + bias + skip) into framed images."""
     row = 0

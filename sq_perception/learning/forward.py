@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.geometry.threads import one_blas_thread
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import layout
 from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous, write_doubled
@@ -77,7 +77,7 @@ class CompactMasks:
         self._backbone = _Backbone(weights, config.pixels, CHANNELS)
         steps = range(len(config.widths) - 1)
         self._up = [_linear(weights, [f"up.{k}"]) for k in steps]
-        self._joined = [Block.folded(weights, f"joined.{k}") for k in steps]
+        self._joined = [Block.fold(weights, f"joined.{k}") for k in steps]
         self._head = _linear(weights, ["head"])
         self._memory = Memory()
 
@@ -85,11 +85,11 @@ class CompactMasks:
         """Logits float32 (n, p, p) of views (n, p, p, CHANNELS)."""
         memory = self._memory
         with one_blas_thread():
-            images = self._backbone.computed(views, memory)
+            images = self._backbone.compute(views, memory)
             stages = [images[0], *images[self.config.blocks :: self.config.blocks]]
             x, side = stages.pop()
             for k in reversed(range(len(stages))):
-                x, side = self._joined[k].computed(
+                x, side = self._joined[k].compute(
                     _upsample(x, side, self._up[k], stages[k][0], memory), 2 * side, memory, f"joined {k}"
                 )
             matrix, bias = self._head
@@ -122,7 +122,7 @@ class _Network:
         return np.concatenate(parts) if parts else np.empty((0, self._heads[0].shape[1]), np.float32)
 
     def _outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
-        x, side = self._backbone.computed(images, self._memory)[-1]
+        x, side = self._backbone.compute(images, self._memory)[-1]
         h = np.concatenate([_inner(x, side).reshape(len(x), -1), more.astype(np.float32, copy=False)], axis=1)
         for matrix, bias in self._mixer:
             h = np.maximum(h @ matrix + bias, 0)
@@ -135,21 +135,21 @@ class _Backbone:
 
     def __init__(self, weights: Weights, pixels: int, channels: int) -> None:
         self._pixels, self._channels = pixels, channels
-        self._stem = Direct.folded(weights, "features.0", "features.1", stride=2)
+        self._stem = Direct.fold(weights, "features.0", "features.1", stride=2)
         self._blocks: list[Block] = []
         while f"features.{3 + len(self._blocks)}.first.weight" in weights:
-            self._blocks.append(Block.folded(weights, f"features.{3 + len(self._blocks)}"))
+            self._blocks.append(Block.fold(weights, f"features.{3 + len(self._blocks)}"))
 
-    def computed(self, images: np.ndarray, memory: Memory) -> list[tuple[np.ndarray, int]]:
+    def compute(self, images: np.ndarray, memory: Memory) -> list[tuple[np.ndarray, int]]:
         """Framed images, and their side, after the stem and after each block."""
         count, side = len(images), self._pixels
         margin = self._stem.size // 2
         framed = memory.zeros("images", (count, side + 2 * margin, side + 2 * margin, self._channels))
         framed[:, margin:-margin, margin:-margin] = images
         side //= 2
-        found = [(self._stem.computed(framed, side, memory, "stem"), side)]
+        found = [(self._stem.compute(framed, side, memory, "stem"), side)]
         for number, block in enumerate(self._blocks):
-            found.append(block.computed(*found[-1], memory, str(number)))
+            found.append(block.compute(*found[-1], memory, str(number)))
         return found
 
 

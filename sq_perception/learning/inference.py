@@ -12,17 +12,19 @@ torch is imported where it computes.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.geometry.threads import one_torch_thread
+from sq_perception.geometry.union import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
@@ -39,16 +41,19 @@ if TYPE_CHECKING:
     from sq_perception.learning.networks import ThingNetwork
 
 
-class Predictor(Protocol):
-    """What a recovery needs of a network."""
+@dataclass(frozen=True, eq=False)
+class Predictor:
+    """A network of bodies, made ready to predict; it is shown each view in four positions, as one batch."""
 
     config: RegressorConfig
+    predict_once: Callable[[np.ndarray], Superquadric]  # bodies (n,) of checked views (n, p, p), in one position
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).
 
         Raises ValueError if the views are not (n, p, p) with p = ``config.pixels``, or not finite.
         """
+        return predict_in_positions(self.predict_once, check_views(views, self.config))
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,13 +123,19 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     """
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
-        return _InPositions(forward.CompactRegressor(config, weights))
+        return Predictor(config, forward.CompactRegressor(config, weights).predict)
     try:
         model = checkpoint.load(path, device).for_inference()
     except ModuleNotFoundError as error:
         what = f"a network of the backbone {config.backbone} on {device}"
         raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
-    return _InPositions(_OnOneThread(model) if _is_cpu(device) else model)
+
+    def predict(views: np.ndarray) -> Superquadric:
+        # On busy cores the slowest of several threads sets the time, and one image is small.
+        with one_torch_thread() if _is_cpu(device) else nullcontext():
+            return model.predict(views)
+
+    return Predictor(config, predict)
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
@@ -143,29 +154,6 @@ def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
     Raises CheckpointError as :func:`checkpoint.read`.
     """
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
-
-
-class _InPositions:
-    """A predictor of bodies that is shown each view in four positions, as one batch."""
-
-    def __init__(self, model: Predictor) -> None:
-        self.config = model.config
-        self._model = model
-
-    def predict(self, views: np.ndarray) -> Superquadric:
-        return predict_in_positions(self._model.predict, check_views(views, self.config))
-
-
-class _OnOneThread:
-    """A predictor of torch: on busy cores the slowest of several threads sets the time, and one image is small."""
-
-    def __init__(self, model: Predictor) -> None:
-        self.config = model.config
-        self._model = model
-
-    def predict(self, views: np.ndarray) -> Superquadric:
-        with one_torch_thread():
-            return self._model.predict(views)
 
 
 def _is_cpu(device: str) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning.network_config import BODY_OUTPUTS, EXTENT, PLANE, MaskConfig, RegressorConfig, ThingConfig
 
@@ -24,7 +24,6 @@ BLOCK = ("first", "first_norm", "second", "second_norm", "shortcut")
 TORCHVISION_BLOCK = ("conv1", "bn1", "conv2", "bn2", "downsample")
 """What torchvision calls them in ResNet-18."""
 _RESNET18_CHANNELS, _RESNET18_BLOCKS = (64, 128, 256, 512), 2
-_HEADS = {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head": 6}
 
 
 def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:
@@ -69,7 +68,7 @@ def _masks(config: MaskConfig) -> Shapes:
 def heads(config: RegressorConfig | ThingConfig) -> dict[str, int]:
     """Name and number of outputs of every head, in the order of the outputs."""
     if isinstance(config, RegressorConfig):
-        return dict(_HEADS)
+        return {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head": 6}
     count = len(DIRECTIONS)
     return {
         "body_head": BODY_OUTPUTS,

@@ -27,7 +27,7 @@ predictor that sees the body alone can only guess it; L_OC over all parameters d
 With the depth image alone
 --------------------------
 No labels, only the canonical view X and its orthographic camera, a line of sight a pixel
-(:mod:`sq_perception.imaging.sight_lines`); on a line that met a surface X is its z, on the others 0.
+(:mod:`sq_perception.imaging.soft_render`); on a line that met a surface X is its z, on the others 0.
 
 Least squares (thesis, equation 7.7), over the points p of the surface
 
@@ -76,18 +76,9 @@ from dataclasses import dataclass
 import torch
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import sight_lines
+from sq_perception.imaging import soft_render
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 
-_SHARPNESS = {"render": (6.0, 100.0)}
-_OTHER_SHARPNESS = (6.0, 25.0)
-_TYPICAL_VOLUME = 0.05
-_CURRICULUM = 0.8
-_ROOT_FLOOR = 1e-6
-_DENSITY = 2.0
-"""D of the soft depth, in units of s."""
-_FREE_SPACE = 4.0
-"""Weight w of the free space."""
 _NOT_ROTATION = ("size", "shape", "translation")
 
 
@@ -102,14 +93,9 @@ def occupancy_loss(
 ) -> torch.Tensor:
     """L_OC of each body, shape (n,).
 
-    Parameters
-    ----------
-    prediction, truth : Superquadric
-        Torch batches (n,).
-    points : (n, N, 3) or (N, 3)
-        Where the occupancies are compared.
-    sharpness : float
-        s of equation 6.6; the surface is a transition about 1/s of the body wide.
+    prediction, truth: Torch batches (n,).
+    points: (n, N, 3) or (N, 3), where the occupancies are compared.
+    sharpness: s of equation 6.6; the surface is a transition about 1/s of the body wide.
     """
     difference = prediction.occupancy(points, sharpness) - truth.occupancy(points, sharpness)
     return (difference * difference).mean(dim=-1)
@@ -142,15 +128,12 @@ def points_around(bodies: Superquadric, count: int, generator: torch.Generator, 
 def least_squares_loss(prediction: Superquadric, lines: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     """L_LS of each body, (n,).
 
-    Parameters
-    ----------
-    prediction : Superquadric
-        Torch batch (n,) in the view's frame.
-    lines, depth : (r, 2), (n, r)
-        Lines of sight and z where they end, 0 for background, as :func:`sight_lines.of_view` gives them.
+    prediction: Torch batch (n,) in the view's frame.
+    lines, depth: (r, 2), (n, r), lines of sight and z where they end, 0 for background, as :func:`soft_render.of_view`
+        gives them.
     """
     seen = depth > 0
-    gauge = sight_lines.gauge(prediction, lines, depth)
+    gauge = soft_render.gauge(prediction, lines, depth)
     # Background lines carry a number that is no depth: cut them off before the square, not after it.
     residual = torch.where(seen, gauge, torch.ones_like(gauge)) ** 2 - 1
     mean = (residual * residual).sum(dim=-1) / seen.sum(dim=-1).clamp(min=1)
@@ -159,7 +142,7 @@ def least_squares_loss(prediction: Superquadric, lines: torch.Tensor, depth: tor
 
 def free_space_loss(prediction: Superquadric, lines: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     """Mean of max(0, 1 - min g)^2 over the empty part of each line, (n,); arguments as above."""
-    excess = sight_lines.free_space_excess(prediction, lines, depth)
+    excess = soft_render.free_space_excess(prediction, lines, depth)
     return (excess * excess).mean(dim=-1)
 
 
@@ -167,7 +150,7 @@ def render_loss(
     prediction: Superquadric, lines: torch.Tensor, depth: torch.Tensor, sharpness: float, density: float
 ) -> torch.Tensor:
     """L_DR of each body, (n,), in the limit of fine voxels; ``density`` is D = n tau."""
-    soft = sight_lines.soft_depth(prediction, lines, sharpness, density, cells=8)
+    soft = soft_render.soft_depth(prediction, lines, sharpness, density, cells=8)
     return (depth - soft).abs().mean(dim=-1)
 
 
@@ -184,8 +167,6 @@ class Objective:
     sharpness_start: float = 0.0
     sharpness_end: float = 0.0
     """s at the start and the end of the run; 0 takes the values of the table."""
-    tau: float = 0.0
-    """n tau / s of the render loss; 0 takes its own value."""
     framing: str = "cropped"
     """Framing of the views."""
     stride: int = 2
@@ -201,7 +182,7 @@ class Objective:
 
     def sharpness(self, progress: float) -> float:
         """s after a share ``progress`` of the run."""
-        start, end = _SHARPNESS.get(self.name, _OTHER_SHARPNESS)
+        start, end = {"render": (6.0, 100.0)}.get(self.name, (6.0, 25.0))
         start, end = self.sharpness_start or start, self.sharpness_end or end
         return start * (end / start) ** progress
 
@@ -227,17 +208,19 @@ class Objective:
             }[self.name]
             return compare(prediction, truth, torch.cat(around, dim=1), s)
         row, column = torch.randint(self.stride, (2,), generator=generator, device=views.device).tolist()
-        lines, depth = sight_lines.of_view(views[:, 0], self.stride, row, column, self.framing)
+        lines, depth = soft_render.of_view(views[:, 0], self.stride, row, column, self.framing)
         if self.name == "render":
-            return render_loss(prediction, lines, depth, s, (self.tau or _DENSITY) * s)
-        smallness = max(0.0, 1 - progress / _CURRICULUM)
+            # D of the soft depth, in units of s.
+            return render_loss(prediction, lines, depth, s, 2.0 * s)
+        smallness = max(0.0, 1 - progress / 0.8)
         loss = least_squares_loss(prediction, lines, depth)
-        loss = loss * (prediction.size.prod(dim=-1) / _TYPICAL_VOLUME) ** smallness
+        loss = loss * (prediction.size.prod(dim=-1) / 0.05) ** smallness
         if self.name == "least_squares_free":
-            loss = loss + _FREE_SPACE * free_space_loss(prediction, lines, depth)
+            # Weight w of the free space.
+            loss = loss + 4.0 * free_space_loss(prediction, lines, depth)
             # The same optimum, but a few badly seen bodies, whose squares are a hundred times those of the others, do
             # not make the whole gradient.
-            loss = torch.sqrt(loss + _ROOT_FLOOR)
+            loss = torch.sqrt(loss + 1e-6)
         return loss
 
     def with_given(self, prediction: Superquadric, truth: Superquadric) -> Superquadric:

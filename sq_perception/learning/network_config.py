@@ -23,13 +23,8 @@ Array = Any
 """A NumPy array or a torch tensor."""
 BODY_OUTPUTS = 14
 """Numbers of a body: size 3, shape 2, translation 3, rotation 6."""
-RESNET18_STRIDE = 32
 PLANE, EXTENT = 4, 1
 """Inputs of the network of things beside the view."""
-_USUAL_EXTENT = 0.2
-"""Metres; that the logarithm of a view's side is 0 for it."""
-_HALF_WAY = 0.5
-"""Depth at which a pixel without a surface is given its height above the plane."""
 LEAST_LOG, MOST_LOG = -5.0, 0.5
 """Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
 
@@ -108,7 +103,7 @@ class RegressorConfig:
     @property
     def stride(self) -> int:
         """Pixels of the view, along x or y, to a cell of the backbone's last stage."""
-        return RESNET18_STRIDE if self.backbone == "resnet18" else 2 ** len(self.widths)
+        return 32 if self.backbone == "resnet18" else 2 ** len(self.widths)
 
 
 @dataclass(frozen=True)
@@ -162,8 +157,10 @@ def side_inputs(views: Array, planes: Array, extents: Array) -> tuple[Array, Arr
     across = (xp.arange(pixels, dtype=views.dtype, device=device(views)) + 0.5) / pixels
     n = planes[:, :, None, None]
     flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
-    heights = flat + n[:, 2] * xp.where(views > 0, views, xp.full_like(views, _HALF_WAY))
-    usual = xp.full_like(extents, _USUAL_EXTENT)
+    # Depth at which a pixel without a surface is given its height above the plane.
+    heights = flat + n[:, 2] * xp.where(views > 0, views, xp.full_like(views, 0.5))
+    # Metres; that the logarithm of a view's side is 0 for it.
+    usual = xp.full_like(extents, 0.2)
     return heights, xp.log(xp.where(extents > 0, extents, usual) / usual)
 
 

@@ -24,7 +24,7 @@ The network of things
 ---------------------
 View and support plane in, support function of the thing's hull out.  h(n) = max over the thing of n.(p - c) is what
 boxes, widths, resting and grasps are made of; it exists for every shape and asks for no order of axes.  For the J
-directions n_j of :data:`sq_perception.geometry.support_directions.DIRECTIONS` the network predicts h ~ t_nu(mu, S), a
+directions n_j of :data:`sq_perception.geometry.union.DIRECTIONS` the network predicts h ~ t_nu(mu, S), a
 multivariate t distribution with
 
     S = diag(sigma^2) + L L^T,    L (J, K),
@@ -69,7 +69,7 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning.layout import BLOCK, CELLS_AT_ONCE, TORCHVISION_BLOCK
@@ -95,12 +95,17 @@ class ResidualBlock(nn.Module):
 
     def __init__(self, channels_in: int, channels_out: int, stride: int, names: Sequence[str] = BLOCK) -> None:
         super().__init__()
+        shortcut: nn.Module = nn.Identity()
+        if stride > 1 or channels_in != channels_out:
+            shortcut = nn.Sequential(
+                nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), nn.BatchNorm2d(channels_out)
+            )
         modules = (
             nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False),
             nn.BatchNorm2d(channels_out),
             nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False),
             nn.BatchNorm2d(channels_out),
-            _shortcut(channels_in, channels_out, stride),
+            shortcut,
         )
         for name, module in zip(names, modules, strict=True):
             self.add_module(name, module)
@@ -163,12 +168,6 @@ def _stage(
     """Residual blocks one after the other, of which the first may halve the resolution."""
     first: list[nn.Module] = [ResidualBlock(channels_in, channels_out, stride, names)]
     return first + [ResidualBlock(channels_out, channels_out, 1, names) for _ in range(blocks - 1)]
-
-
-def _shortcut(channels_in: int, channels_out: int, stride: int) -> nn.Module:
-    if stride == 1 and channels_in == channels_out:
-        return nn.Identity()
-    return nn.Sequential(nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), nn.BatchNorm2d(channels_out))
 
 
 class Regressor(nn.Module):

@@ -23,18 +23,15 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 
-_SHOWN = ((0, False), (0, True), (2, False), (2, True))
-"""Positions that a network is shown, each of which undoes itself."""
-_FARTHEST = float(np.cos(np.deg2rad(15.0)))
-"""Cosine of half of the largest angle between two turns that are averaged."""
-
 
 def predict_in_positions(predict: Callable[[np.ndarray], Superquadric], views: np.ndarray) -> Superquadric:
     """Bodies (n,) of views (n, p, p), of which ``predict`` gives those of any number of views."""
-    turns, mirror = (np.repeat(each, len(views)) for each in zip(*_SHOWN, strict=True))
-    shown = move_images(np.concatenate([views] * len(_SHOWN)), turns, mirror)
+    # Positions that a network is shown, each of which undoes itself.
+    positions = ((0, False), (0, True), (2, False), (2, True))
+    turns, mirror = (np.repeat(each, len(views)) for each in zip(*positions, strict=True))
+    shown = move_images(np.concatenate([views] * len(positions)), turns, mirror)
     flat = move_bodies(predict(shown), turns, mirror).to_flat()
-    return mean(Superquadric.from_flat(flat.reshape(len(_SHOWN), len(views), -1)))
+    return mean(Superquadric.from_flat(flat.reshape(len(positions), len(views), -1)))
 
 
 def move_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
@@ -60,15 +57,17 @@ def move_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> 
 
 def mean(answers: Superquadric) -> Superquadric:
     """The means (n,) of answers (k, n); see the module."""
+    # Cosine of half of the largest angle between two turns that are averaged.
+    farthest = float(np.cos(np.deg2rad(15.0)))
     forms = answers.equivalent_forms()
     cosines = np.einsum("fkni,rni->fkrn", forms.rotation, answers.rotation)
     each = np.arange(answers.batch_shape[1])
-    chosen = np.argmax((np.abs(cosines).max(axis=0) > _FARTHEST).sum(axis=0), axis=0)
+    chosen = np.argmax((np.abs(cosines).max(axis=0) > farthest).sum(axis=0), axis=0)
     cosines = cosines[:, :, chosen, each]
     nearest = np.argmax(np.abs(cosines), axis=0)
     near = forms[nearest, np.arange(len(answers))[:, None], each]
     cosine = np.take_along_axis(cosines, nearest[None], axis=0)[0]
-    weights = ((np.abs(cosine) > _FARTHEST) / (np.abs(cosine) > _FARTHEST).sum(axis=0))[..., None]
+    weights = ((np.abs(cosine) > farthest) / (np.abs(cosine) > farthest).sum(axis=0))[..., None]
     turn = (weights * np.sign(cosine)[..., None] * near.rotation).sum(axis=0)
     return Superquadric(
         np.exp((weights * np.log(near.size)).sum(axis=0)),

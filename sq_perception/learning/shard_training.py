@@ -43,7 +43,7 @@ from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file
-from sq_perception.geometry.support_directions import mirrored
+from sq_perception.geometry.union import mirrored
 from sq_perception.imaging.segment_view import HEIGHT, OTHERS, PLANE, SEGMENT
 from sq_perception.learning import checkpoint
 from sq_perception.learning.inference import check_device

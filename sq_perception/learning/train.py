@@ -34,12 +34,6 @@ _VALIDATED = ("pinhole_share", "noisy_share", "occluded_share", "validation")
 """Settings that decide what a network is validated on."""
 _FORM = ("backbone", "framing", "pixels")
 """Settings that a network to begin with brings along."""
-_CALIBRATION = 2048
-"""Views from which normalisations are measured anew."""
-_BATCH = 250
-"""Views of a validation that are computed at once."""
-_HIDDEN = 0.3
-"""Share of each body that is hidden in the validation set ``hidden``."""
 
 
 def train(
@@ -50,16 +44,10 @@ def train(
 ) -> Regressor:
     """Run, or continue, a training; returns the averaged network, also saved in ``output``.
 
-    Parameters
-    ----------
-    config
-        The run.
-    output
-        The folder of the run.
-    network
-        A form other than that of ``config``.
-    advance
-        Called with the steps done and the loss of the last one.
+    config: The run.
+    output: The folder of the run.
+    network: A form other than that of ``config``.
+    advance: Called with the steps done and the loss of the last one.
 
     Raises ArithmeticError or Stopped as :func:`sq_perception.learning.training.run`; CheckpointError if a file to begin
     or to go on with does not fit; ValueError for a device that this machine does not have, or data or a network to
@@ -84,16 +72,15 @@ def train(
 
 
 def _course(config: TrainingConfig, state: TrainingState, device: torch.device) -> Course:
+    calibration = 2048  # views from which normalisations are measured anew
     form = state.model.config
-    objective = Objective(
-        config.loss, config.points, config.sharpness_start, config.sharpness_end, config.tau, config.framing
-    )
+    objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end, config.framing)
     seed = np.random.SeedSequence([config.seed, state.step])
     generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
     disturbance = Disturbance(config.occluded_share, config.noisy_share)
     source = ViewSource(form.pixels, config.pinhole_share, config.wide_share, disturbance, form.framing)
     # A short run holds no more views than it takes.
-    taken = max(config.steps * config.batch, _CALIBRATION if config.average > 0 else 0)
+    taken = max(config.steps * config.batch, calibration if config.average > 0 else 0)
     pool = ViewPool(np.random.default_rng(seed), source, min(POOL, taken), config.reuse)
     sets = _validation_sets(config, form)
 
@@ -112,7 +99,7 @@ def _course(config: TrainingConfig, state: TrainingState, device: torch.device) 
 
     def validate_sets(network: Regressor) -> dict[str, float]:
         if config.average > 0:
-            views, _ = pool.batch(max(_CALIBRATION, config.batch))
+            views, _ = pool.batch(max(calibration, config.batch))
             recalibrate(network, torch.from_numpy(views)[:, None], max(config.batch, 32))
         found = {}
         for name, (views, truth) in sets.items():
@@ -135,7 +122,8 @@ def validate(
 
     With an ``objective`` for which some parameters are given, those are taken from the truth.
     """
-    flats = [model.predict(views[i : i + _BATCH]).to_flat() for i in range(0, len(views), _BATCH)]
+    at_once = 250  # views of a validation that are computed at once
+    flats = [model.predict(views[i : i + at_once]).to_flat() for i in range(0, len(views), at_once)]
     prediction = Superquadric.from_flat(np.concatenate(flats))
     return volume_iou(objective.with_given(prediction, truth) if objective else prediction, truth)
 
@@ -177,7 +165,8 @@ def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[s
         sets["iou_worn"] = Disturbance(noisy_share=1.0).apply(near, rng), bodies
     if config.occluded_share > 0:
         rng = np.random.default_rng(seed)
-        occluder = any_occluder(np.full(count, _HIDDEN), rng)
+        # Share of each body that is hidden in the validation set ``hidden``.
+        occluder = any_occluder(np.full(count, 0.3), rng)
         sets["iou_hidden"] = draw_views(count, rng, ViewSource(pixels, config.pinhole_share), occluder)
     if config.canonical_labels:  # what is given to the network counts as it was given in training
         return {name: (views, bodies.canonical_form()) for name, (views, bodies) in sets.items()}

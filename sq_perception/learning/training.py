@@ -35,11 +35,6 @@ from sq_perception.learning import checkpoint
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.training_config import Plateau, Run
 
-_CLIP = 1.0
-"""Largest norm of the gradient."""
-_SAVE_SECONDS = 300.0
-"""Longest time between two saved states."""
-
 
 class Stopped(Exception):  # noqa: N818 - nothing is wrong
     """A run that was asked to stop; its state is saved."""
@@ -168,7 +163,8 @@ class TrainingState:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), _CLIP)
+        # Largest norm of the gradient.
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), 1.0)
         if not torch.isfinite(loss) & torch.isfinite(norm):
             raise ArithmeticError(
                 f"step {self.step}: loss {loss.item():.4g}, norm of the gradient {norm.item():.4g}; "
@@ -235,7 +231,8 @@ def run(
                 break
             if state.step % config.validation == 0:
                 validate()
-            if stop_requested() or time.monotonic() - saved > _SAVE_SECONDS:
+            # Longest time between two saved states.
+            if stop_requested() or time.monotonic() - saved > 300.0:
                 state.save()
                 saved = time.monotonic()
             if stop_requested():

@@ -34,8 +34,6 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "schedule": ("cosine", "plateau"),
 }
 """Fields that name something, and the names there are."""
-_SEEDS = 2**63
-"""Seeds are below it, as torch takes them."""
 
 
 def _setting(default: Any, meaning: str) -> Any:
@@ -143,7 +141,6 @@ class TrainingConfig(Run):
         0.0, "s of the loss at the start of the run, far basins first; 0 takes the loss's own value."
     )
     sharpness_end: float = _setting(0.0, "s of the loss at the end of the run.")
-    tau: float = _setting(0.0, "n tau / s of the render loss, how soon a ray is hit (7.10); 0 takes 2.")
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
@@ -151,13 +148,14 @@ class TrainingConfig(Run):
         for name, least in (("steps", 1), ("batch", 1), ("points", 2), ("validation", 1), ("reuse", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
-        for name in ("seed", "threads", "sharpness_start", "sharpness_end", "tau"):
+        for name in ("seed", "threads", "sharpness_start", "sharpness_end"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
         for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
-        if self.seed >= _SEEDS:
+        # Seeds are below it, as torch takes them.
+        if self.seed >= 2**63:
             raise ValueError(f"seed: expected a number below 2^63, got {self.seed}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate: expected a positive number, got {self.learning_rate}")

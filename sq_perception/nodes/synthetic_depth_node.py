@@ -151,7 +151,7 @@ class FrameSource:
             self._left = self._hold
         self._left -= 1
         model = Ideal(noise / 255 if self.clean.is_cube else noise) if sensor == IDEAL else preset(sensor)
-        return replace(self.clean, depth=model.measured(self.clean.depth, self.clean.camera, self._noise))
+        return replace(self.clean, depth=model.measure(self.clean.depth, self.clean.camera, self._noise))
 
 
 def generate(

@@ -14,10 +14,10 @@ import numpy as np
 
 from sq_perception.fitting.options import ON_SUPPORT
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import canonical_view, depth_steps, lens, regions
+from sq_perception.imaging import canonical_view, depth_steps, raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.coherence import coherent, shown_step
+from sq_perception.imaging.depth_steps import coherent, shown_step
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.segmentation.evidence import FrameEvidence
@@ -90,7 +90,7 @@ class SeenObject:
     def heights(self, plane: np.ndarray) -> np.ndarray:
         """Heights above a plane (4,), metres, of the pixels of ``mask_crop``; NaN elsewhere."""
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
-        return lens.heights(depth, mask, self.camera_crop.lens, plane)
+        return raycast.heights(depth, mask, self.camera_crop.lens, plane)
 
     @cached_property
     def step(self) -> float:
@@ -150,7 +150,7 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
         return obj
     around, near, names, view = surroundings(obj, depth, labels, camera, _MOST_ROWS)
     unnamed = np.isfinite(near) & (names == 0)
-    free = unnamed & (lens.heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
+    free = unnamed & (raycast.heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
     mask, rows = names == obj.label, 0
     while rows < _MOST_ROWS:
         rim = (cv2.dilate(mask.view(np.uint8), depth_steps.CROSS) > 0) & ~mask

@@ -21,7 +21,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.quantiles import densest, quantile
-from sq_perception.imaging import lens
+from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
 from sq_perception.segmentation import segments, support_plane
@@ -105,7 +105,7 @@ def _is_held(
     outer, inner = (cv2.dilate(own, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (farthest, nearest))
     beside = outer > inner
     seen = beside & (names == 0) & (near < quantile(obj.depth_crop[obj.mask_crop], 0.5) + obj.step)
-    above = lens.heights(near, seen, view.lens, plane) > low
+    above = raycast.heights(near, seen, view.lens, plane) > low
     return bool(np.count_nonzero(above) > _HELD * np.count_nonzero(beside))
 
 

@@ -4,20 +4,20 @@ Every stage takes and gives depth (height, width), float32 metres, NaN where not
 depth w = 1 / z, in which stereo cameras filter, and x, s the value and the filtered value along a row or column:
 
     temporal    s_k = a x_k + (1 - a) s_(k-1) over frames k if |x_k - s_(k-1)| < d, else x_k; s_(k-1) if x_k is missing
-    decimated   the median of the readings of n x n pixels; focal lengths and principal point follow
+    decimate    the median of the readings of n x n pixels; focal lengths and principal point follow
     spatial     the same recursion along each row, forth and back, then along each column; some rounds of that
     ring        beside a step of more than a share of z nothing is measured: n pixels on its far side, m on its near one
-    filled      a missing reading is its left neighbour, or the farthest or nearest of five neighbours, in raster order
-    aligned     p' = p - b, each reading drawn where it is seen from b, as a point or as a rectangle; the nearest wins
-    bent        z (1 + k.(x - x0) + q |x - x0|^2), x = (X / Z, Y / Z): nothing moves at x0
+    fill        a missing reading is its left neighbour, or the farthest or nearest of five neighbours, in raster order
+    align       p' = p - b, each reading drawn where it is seen from b, as a point or as a rectangle; the nearest wins
+    bend        z (1 + k.(x - x0) + q |x - x0|^2), x = (X / Z, Y / Z): nothing moves at x0
     median      over n x n pixels, in which a missing reading is 0, as in images of whole millimetres
-    rounded     to whole steps
+    round_depth to whole steps
     blocks      w without what JPEG's quantisation of 8 x 8 blocks loses
 
 References
 ----------
-librealsense, post-processing filters (doc/post-processing-filters.md, src/proc): the equations of temporal, decimated,
-spatial and filled, their ranges and defaults; align: rectangles.  The edge is kept by Gastal & Oliveira, Domain
+librealsense, post-processing filters (doc/post-processing-filters.md, src/proc): the equations of temporal, decimate,
+spatial and fill, their ranges and defaults; align: rectangles.  The edge is kept by Gastal & Oliveira, Domain
 transform for edge-aware image and video processing, SIGGRAPH 2011.  depth_image_proc (ROS), register: points.
 """
 
@@ -35,8 +35,6 @@ from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
 Filling = Literal["left", "farthest", "nearest"]
-_BLOCK = 8
-"""Side of JPEG's blocks, pixels."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def temporal(frames: Sequence[np.ndarray], factor: float, threshold: float) -> n
     return _inverse(held)
 
 
-def decimated(depth: np.ndarray, times: int) -> np.ndarray:
+def decimate(depth: np.ndarray, times: int) -> np.ndarray:
     """Depth (height // n, width // n)."""
     height, width = depth.shape[0] // times, depth.shape[1] // times
     cells = depth[: times * height, : times * width].reshape(height, times, width, times).swapaxes(1, 2)
@@ -106,7 +104,7 @@ def decimated(depth: np.ndarray, times: int) -> np.ndarray:
     return np.take_along_axis(ordered, middle[..., None], axis=2)[..., 0]
 
 
-def decimated_camera(camera: Camera, times: int) -> Camera:
+def decimate_camera(camera: Camera, times: int) -> Camera:
     """The camera of a decimated image; pixels' centres are whole numbers in both."""
     size = camera.width // times, camera.height // times
     cx, cy = ((each + 0.5) / times - 0.5 for each in (camera.cx, camera.cy))
@@ -145,14 +143,14 @@ def ring_around(depth: np.ndarray, mask: np.ndarray, outer: int) -> np.ndarray:
     return np.where(near & ~mask, np.float32(np.nan), depth)
 
 
-def filled(depth: np.ndarray, rule: Filling) -> np.ndarray:
+def fill(depth: np.ndarray, rule: Filling) -> np.ndarray:
     """Missing readings filled from the neighbours that ``rule`` says; see the module."""
     out = depth.copy()
     _fill(out, get_args(Filling).index(rule))
     return out
 
 
-def aligned(depth: np.ndarray, camera: Camera, beside: np.ndarray, onto: Camera, whole: bool) -> np.ndarray:
+def align(depth: np.ndarray, camera: Camera, beside: np.ndarray, onto: Camera, whole: bool) -> np.ndarray:
     """The depth that a camera ``onto`` has of one that ``camera`` measured.
 
     ``beside`` (3,) is where ``camera`` is in the frame of ``onto``, metres; they look in parallel.  ``whole`` pixels
@@ -164,7 +162,7 @@ def aligned(depth: np.ndarray, camera: Camera, beside: np.ndarray, onto: Camera,
     return out
 
 
-def bent(depth: np.ndarray, camera: Camera, at: np.ndarray, slope: np.ndarray, bow: float) -> np.ndarray:
+def bend(depth: np.ndarray, camera: Camera, at: np.ndarray, slope: np.ndarray, bow: float) -> np.ndarray:
     """Bent by ``slope`` k (2,) and ``bow`` q about the ray ``at`` x0 (2,); see the module."""
     x = (np.arange(camera.width) - camera.cx) / camera.fx - at[0]
     y = ((np.arange(camera.height) - camera.cy) / camera.fy - at[1])[:, None]
@@ -176,7 +174,7 @@ def median(depth: np.ndarray, side: Literal[3, 5]) -> np.ndarray:
     return _known(cv2.medianBlur(np.nan_to_num(depth, nan=0.0).astype(np.float32), side))
 
 
-def rounded(depth: np.ndarray, step: float) -> np.ndarray:
+def round_depth(depth: np.ndarray, step: float) -> np.ndarray:
     """Depths in whole steps, metres."""
     return _known(np.rint(depth / np.float32(step)) * np.float32(step))
 
@@ -187,13 +185,14 @@ def blocks(depth: np.ndarray, quantum: float) -> np.ndarray:
     The steps of waves grow with their frequency, (1 + i + j) quantum, as those of JPEG do about.  Missing readings are
     0 in the image that is compressed, and known to be missing afterwards, as a mask goes with it.
     """
+    side = 8  # side of JPEG's blocks, pixels
     height, width = depth.shape
     w = np.nan_to_num(_inverse(depth), nan=0.0)
-    w = np.pad(w, ((0, -height % _BLOCK), (0, -width % _BLOCK)), mode="edge")
-    steps = np.float32(quantum * _BLOCK) * (1 + np.add(*np.indices((_BLOCK, _BLOCK), np.float32)))
-    for top in range(0, height, _BLOCK):
-        for left in range(0, width, _BLOCK):
-            block = np.s_[top : top + _BLOCK, left : left + _BLOCK]
+    w = np.pad(w, ((0, -height % side), (0, -width % side)), mode="edge")
+    steps = np.float32(quantum * side) * (1 + np.add(*np.indices((side, side), np.float32)))
+    for top in range(0, height, side):
+        for left in range(0, width, side):
+            block = np.s_[top : top + side, left : left + side]
             w[block] = cv2.idct(np.rint(cv2.dct(w[block]) / steps) * steps)
     w = np.where(w < quantum, np.float32(np.nan), w)[:height, :width]
     return np.where(np.isnan(depth), np.float32(np.nan), _inverse(w))
@@ -224,7 +223,7 @@ class Stages:
     step: float = 0.0
     quantum: float = 0.0
 
-    def processed(self, depth: np.ndarray, thing: np.ndarray, camera: Camera) -> np.ndarray:
+    def process(self, depth: np.ndarray, thing: np.ndarray, camera: Camera) -> np.ndarray:
         """The depth after all stages that keep its camera; ``thing`` bool (height, width) is what a ring goes around,
         and the middle of what is bent."""
         if self.outer:
@@ -233,16 +232,16 @@ class Stages:
         if self.rounds:
             depth = spatial(depth, self.factor, self.threshold, self.rounds)
         if self.filling is not None:
-            depth = filled(depth, self.filling)
+            depth = fill(depth, self.filling)
         if self.bow or any(self.slope):
             rows, columns = np.nonzero(thing)
             middle = (columns.mean() - camera.cx) / camera.fx, (rows.mean() - camera.cy) / camera.fy
-            depth = bent(depth, camera, np.array(middle), np.array(self.slope), self.bow)
+            depth = bend(depth, camera, np.array(middle), np.array(self.slope), self.bow)
         if self.median:
             depth = median(depth, self.median)
         if self.quantum:
             depth = blocks(depth, self.quantum)
-        return rounded(depth, self.step) if self.step else depth
+        return round_depth(depth, self.step) if self.step else depth
 
 
 def draw_stages(rng: np.random.Generator, ranges: StageRanges = RANGES) -> Stages:
@@ -329,7 +328,7 @@ def _draw(
     onto: tuple[float, float, float, float, bool],
     half: float,
 ) -> None:
-    """Draw readings into another camera's image of +inf, each as wide as twice ``half`` pixels; see :func:`aligned`."""
+    """Draw readings into another camera's image of +inf, each as wide as twice ``half`` pixels; see :func:`align`."""
     fx, fy, cx, cy, _ = lens
     gx, gy, ox, oy, _ = onto
     for v in range(depth.shape[0]):

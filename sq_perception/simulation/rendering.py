@@ -40,23 +40,13 @@ def render_things(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render depth and the index of the visible object of every pixel.
 
-    Parameters
-    ----------
-    parts, cavities : Superquadric
-        Batches (k,) and (m,) in the optical frame of a pinhole camera.
-    owner, cavity_owner : int (k,), (m,)
-        The object that each belongs to.
-    table : (4,), optional
-        A plane n.p + d = 0, n up, that objects stand on.
-    behind : float
-        Depth of a wall across the whole image, metres.
+    parts, cavities: Batches (k,) and (m,) in the optical frame of a pinhole camera.
+    owner, cavity_owner: int (k,), (m,), the object that each belongs to.
+    table: (4,), a plane n.p + d = 0, n up, that objects stand on.
+    behind: Depth of a wall across the whole image, metres.
 
-    Returns
-    -------
-    depth : float64 (height, width)
-        Metres, +inf where there is nothing.
-    thing : int32 (height, width)
-        Owner of the visible part, -1 where there is none.
+    Returns depth, float64 (height, width), metres, +inf where there is nothing, and the visible part's owner, int32
+    (height, width), -1 where there is none.
     """
     depth, index = render(parts, camera)
     thing = np.append(np.asarray(owner, dtype=np.int32), np.int32(-1))[index]
@@ -86,12 +76,7 @@ def _add_background(plane: np.ndarray, behind: float, lens: Lens, depth: np.ndar
 
 @parallel_kernel
 def _hollow_out(
-    flat: np.ndarray,
-    matrices: np.ndarray,
-    owner: np.ndarray,
-    lens: Lens,
-    depth: np.ndarray,
-    thing: np.ndarray,
+    flat: np.ndarray, matrices: np.ndarray, owner: np.ndarray, lens: Lens, depth: np.ndarray, thing: np.ndarray
 ) -> None:
     fx, fy, cx, cy, _ = lens
     for v in numba.prange(depth.shape[0]):

@@ -51,5 +51,5 @@ def sample(seed: int = 0) -> Sample:
         turn = quaternions.from_matrix(table @ turn_about_up(np.deg2rad(degrees)))
         bodies.append(Superquadric(size, np.array(shape), centre, turn))
     scene = Scene(Superquadric.stack(bodies), TABLE_CAMERA, np.append(up, -up @ looked_at))
-    depth = preset(SENSOR).measured(scene.render()[0], scene.camera, np.random.default_rng(seed))
+    depth = preset(SENSOR).measure(scene.render()[0], scene.camera, np.random.default_rng(seed))
     return Sample(depth.astype(np.float32), scene.camera, scene.bodies, tuple(THINGS))

@@ -91,7 +91,7 @@ def _measure(rng: np.random.Generator) -> _Measured:
         depth = thing_views.measure_by_any(true_depth, shown > 0, camera, Stages(), rng)
     else:
         sensors = ("realsense_d435", "kinect_v1", "realsense_d435", "kinect_v1", "azure_kinect", "zed")
-        depth = sensor_noise.preset(str(rng.choice(sensors))).measured(true_depth, camera, rng)
+        depth = sensor_noise.preset(str(rng.choice(sensors))).measure(true_depth, camera, rng)
     window = _cut(shown, rng)
     depth, true_depth, shown = (np.ascontiguousarray(each[window]) for each in (depth, true_depth, shown))
     camera = camera.cropped(window[1].start, window[0].start, depth.shape[1], depth.shape[0])
@@ -119,11 +119,11 @@ def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.n
         view = measured.view(found.labels, label, found.plane)
         shown = measured.shown[found.labels == label]
         yield view.image, _truth(*measured.in_cells(view), _object(shown))
-        yield from _of_pieces(view, measured, rng)
-        yield from _of_merged(label, found, measured, rng)
+        yield from _views_of_pieces(view, measured, rng)
+        yield from _views_of_merged(label, found, measured, rng)
 
 
-def _of_merged(
+def _views_of_merged(
     label: int, found: FrameEvidence, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Return images and truth of each object in a merged segment, and of pieces of it joined to a neighbour."""
@@ -140,10 +140,10 @@ def _of_merged(
     others = others[others > label]
     if len(others) and rng.random() < 0.3:
         both = np.where(found.labels == rng.choice(others), np.int32(label), found.labels)
-        yield from _of_pieces(measured.view(both, label, found.plane), measured, rng)
+        yield from _views_of_pieces(measured.view(both, label, found.plane), measured, rng)
 
 
-def _of_pieces(
+def _views_of_pieces(
     view: SegmentView, measured: _Measured, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Return images and truth of pieces of a segment that show one object: one piece, or all if they show several."""

@@ -1,7 +1,7 @@
 """Models of real depth sensors: noise, steps, edges and holes of a true depth image.
 
     model = sensor_noise.preset("kinect_v1")
-    model.measured(depth, camera, rng)                # what it reports of a true depth image, NaN where nothing
+    model.measure(depth, camera, rng)                # what it reports of a true depth image, NaN where nothing
     model.sigma(z, cosine), model.dropout(z, cosine)  # what it claims of a surface at depth z
 
 z is depth in metres, +inf or NaN where nothing is seen; theta the angle between the surface's normal and the ray.
@@ -60,17 +60,12 @@ _FARTHEST_MOVE = 4
 class SensorNoise(ABC):
     """A depth sensor; see the module."""
 
-    def measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+    def measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
         """Measure a true depth image: float32 (height, width) metres, NaN for no reading.
 
-        Parameters
-        ----------
-        depth : floating (height, width)
-            True depth in metres, +inf or NaN where nothing is seen.
-        camera : Camera
-            Of the image; a pinhole for all sensors but :class:`Ideal`.
-        rng : numpy.random.Generator
-            The same state gives the same image.
+        depth: floating (height, width), true depth in metres, +inf or NaN where nothing is seen.
+        camera: Of the image; a pinhole for all sensors but :class:`Ideal`.
+        rng: The same state gives the same image.
 
         Raises ValueError or TypeError if the image is not of floating numbers or not of the camera's size, shows depths
         that are not positive to a pinhole camera, or the camera or the generator are of another kind.
@@ -163,7 +158,7 @@ class Triangulation(SensorNoise):
     def _measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
         scene = InverseDepth.of(depth, camera)
         cosine, lost = scene.cosine(), scene.hidden_from(self.baseline)
-        scene, lost = self._matched(scene, lost)
+        scene, lost = self._match(scene, lost)
         w, cosine, lost = self._wander(scene, cosine, lost, rng)
         lost |= w == 0
         z = 1 / np.where(lost, np.float32(1 / self.near), w)
@@ -177,7 +172,7 @@ class Triangulation(SensorNoise):
         with np.errstate(divide="ignore"):
             return np.where(lost, np.float32(np.nan), 1 / w).astype(np.float32)
 
-    def _matched(self, scene: InverseDepth, lost: np.ndarray) -> tuple[InverseDepth, np.ndarray]:
+    def _match(self, scene: InverseDepth, lost: np.ndarray) -> tuple[InverseDepth, np.ndarray]:
         """Return what matching makes of the scene and of the pixels lost so far."""
         return scene, lost
 
@@ -248,7 +243,7 @@ class Stereo(Triangulation):
     def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray:
         return np.square(z) * (self.subpixel / (self.focal * abs(self.baseline)))
 
-    def _matched(self, scene: InverseDepth, lost: np.ndarray) -> tuple[InverseDepth, np.ndarray]:
+    def _match(self, scene: InverseDepth, lost: np.ndarray) -> tuple[InverseDepth, np.ndarray]:
         column = np.arange(scene.w.shape[1], dtype=np.float32) - scene.w * np.float32(scene.camera.fx * self.baseline)
         outside = (column < 0) | (column > scene.w.shape[1] - 1)
         if self.fattening:

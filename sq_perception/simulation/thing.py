@@ -101,12 +101,7 @@ def one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
     return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
 
 
-def part(
-    size: Numbers,
-    shape: Numbers,
-    at: Numbers = (0.0, 0.0, 0.0),
-    turn: Numbers = (0.0, 0.0, 0.0, 1.0),
-) -> Row:
+def part(size: Numbers, shape: Numbers, at: Numbers = (0.0, 0.0, 0.0), turn: Numbers = (0.0, 0.0, 0.0, 1.0)) -> Row:
     """Return a superquadric of half sizes, exponents, centre, quaternion."""
     return (*size, *shape, *at, *turn)
 
@@ -141,8 +136,6 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
-LARGEST, SMALLEST = 1.0, 0.005
-"""Longest edge of the box around an object, metres: others are taken for other units."""
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
@@ -158,6 +151,7 @@ def read_things(folder: Path) -> tuple[Thing, ...]:
 
 
 def _read(path: Path) -> Thing:
+    largest, smallest = 1.0, 0.005  # longest edge of the box around an object, metres: others are taken for other units
     import trimesh
 
     try:
@@ -170,9 +164,9 @@ def _read(path: Path) -> Thing:
     except Exception as error:  # whatever a reader of one of many formats raises
         raise ValueError(f"{path}: no mesh with a volume: {error}") from error
     longest = float(np.ptp(hull.vertices, axis=0).max())
-    if not SMALLEST <= longest <= LARGEST:
+    if not smallest <= longest <= largest:
         raise ValueError(
-            f"{path}: expected metres, a thing of {SMALLEST} to {LARGEST}; its longest edge is {longest:.4g}"
+            f"{path}: expected metres, a thing of {smallest} to {largest}; its longest edge is {longest:.4g}"
         )
     middle = hull.bounds.mean(axis=0)
     corners = hull.vertices - middle

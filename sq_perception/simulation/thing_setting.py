@@ -188,11 +188,8 @@ def _with_neighbours(
         gap = 0.0 if rng.random() < 0.3 else rng.uniform(0, 0.08)
         far = flat_support(parts, way[None])[0] + flat_support(row[None], -way[None])[0] + gap
         row[5:7] = far * way[:2] + rng.normal(0, 0.02) * np.array([-way[1], way[0]])
-        if all(_apart(row[None], other[None]) for other in rows):
+        # One of some vertical planes parts it from each of the others.
+        reach = flat_support(row[None], _LEVEL)
+        if all((reach + flat_support(other[None], -_LEVEL) <= 0).any() for other in rows):
             rows.append(row)
     return rows
-
-
-def _apart(row: np.ndarray, other: np.ndarray) -> bool:
-    """Return whether one of some vertical planes separates both."""
-    return bool((flat_support(row, _LEVEL) + flat_support(other, -_LEVEL) <= 0).any())

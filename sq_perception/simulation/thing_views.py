@@ -28,13 +28,12 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.geometry.union import support_of_union
+from sq_perception.geometry.union import DIRECTIONS, support_of_union
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.coherence import coherent, shown_step
-from sq_perception.simulation.camera_stages import Stages, aligned, decimated, decimated_camera, draw_stages, temporal
+from sq_perception.imaging.depth_steps import coherent, shown_step
+from sq_perception.simulation.camera_stages import Stages, align, decimate, decimate_camera, draw_stages, temporal
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 from sq_perception.simulation.thing import Thing
@@ -44,7 +43,6 @@ _PIXELS = 64
 """Side of the views: what the network of objects takes."""
 _LEAST_SEEN = 40
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
-_ATTEMPTS = 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +80,8 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
 
 def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
     """Draw an object, its view, the plane in the view's frame and its support function."""
-    for _ in range(_ATTEMPTS):
+    attempts = 50
+    for _ in range(attempts):
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < 0.5 else draw_thing(rng)
         setting = draw_setting(thing, rng)
         stages = draw_stages(rng)
@@ -110,7 +109,7 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         if np.abs(reach).max() > 3.0 or (reach + reach[_OPPOSITE]).max() < 0.6:
             continue
         return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
-    raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
+    raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {attempts} attempts")
 
 
 def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
@@ -126,14 +125,14 @@ def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tupl
         sensor = Camera(*size, stages.focal * camera.fx, stages.focal * camera.fy, cx, stages.focal * camera.cy)
         near, whose = setting.view_from(place, sensor).render()
         measured = measure_by_any(near, whose, sensor, stages, rng) if whose.any() else near
-        return aligned(measured, sensor, place, camera, stages.whole), seen, camera
+        return align(measured, sensor, place, camera, stages.whole), seen, camera
     depth, seen = _something_before(depth, seen, rng)
     if stages.decimation > 1:
         half = slice(stages.decimation // 2, None, stages.decimation)
-        kept = decimated_camera(camera, stages.decimation)
+        kept = decimate_camera(camera, stages.decimation)
         shown = np.s_[: kept.height, : kept.width]
         measured = measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth
-        return decimated(measured, stages.decimation), seen[half, half][shown], kept
+        return decimate(measured, stages.decimation), seen[half, half][shown], kept
     return measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
 
 
@@ -254,7 +253,7 @@ def measure_by_any(
 ) -> np.ndarray:
     """Measure a true depth image with a random sensor and these camera stages."""
     sensor = draw_sensor(camera, rng)
-    frames = [sensor.measured(depth, camera, rng) for _ in range(stages.frames)]
+    frames = [sensor.measure(depth, camera, rng) for _ in range(stages.frames)]
     measured = temporal(frames, stages.factor, stages.threshold) if len(frames) > 1 else frames[0]
     if rng.random() < 0.4:
         measured += _waves(measured.shape, rng) * np.square(measured)
@@ -274,7 +273,7 @@ def measure_by_any(
     if rng.random() < 0.5:
         filled = ~seen & np.isnan(measured) & np.isfinite(depth)
         measured[filled] = depth[filled]
-    return stages.processed(measured, seen, camera)
+    return stages.process(measured, seen, camera)
 
 
 def _waves(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:

@@ -140,12 +140,7 @@ def things_on_table(
 
 
 def _arrange(
-    count: int,
-    look: np.ndarray,
-    eye: np.ndarray,
-    camera: Camera,
-    rng: np.random.Generator,
-    kinds: Sequence[str] | None,
+    count: int, look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator, kinds: Sequence[str] | None
 ) -> list[_Resting] | None:
     resting: list[_Resting] = []
     spread = rng.uniform(0.08, 0.3)

@@ -57,29 +57,17 @@ def render_views(
 ) -> tuple[np.ndarray, Superquadric]:
     """Render the canonical view of each body alone, fitted to its visible part as :func:`canonical_view.from_mask`.
 
-    Parameters
-    ----------
-    bodies : Superquadric
-        NumPy batch (n,), in a frame like the cube's: y up, z towards the viewer.
-    pixels : int
-        Side of the views.
-    levels : (n,), optional
-        Grey levels per unit of the bodies' frame: depths are rounded down to them, as in an image of integers.
-    distance : (n,), optional
-        Distance of a pinhole camera from the nearest face of the body's box, in the bodies' unit; infinite, as by
-        default, for an orthographic camera.
-    occluder : Occluder, optional
-        What stands before the bodies; its pixels are :data:`HIDDEN`.
-    miss : (n, 4), optional
-        How far the view's middle (x, y), nearest depth (z) and the logarithm of its side are off, the first three in
-        sides: errors of a mask and of noisy depths.
+    bodies: NumPy batch (n,), in a frame like the cube's: y up, z towards the viewer.
+    pixels: Side of the views.
+    levels: (n,), grey levels per unit of the bodies' frame: depths are rounded down to them, as in an image of
+        integers.
+    distance: (n,), distance of a pinhole camera from the nearest face of the body's box, in the bodies' unit; infinite,
+        as by default, for an orthographic camera.
+    occluder: What stands before the bodies; its pixels are :data:`HIDDEN`.
+    miss: (n, 4), how far the view's middle (x, y), nearest depth (z) and the logarithm of its side are off, the first
+        three in sides: errors of a mask and of noisy depths.
 
-    Returns
-    -------
-    images : float32 (n, pixels, pixels)
-    bodies : Superquadric
-        The batch in the canonical frame of its views.
-
+    Returns images, float32 (n, pixels, pixels), and the batch in the canonical frame of its views.
     Raises ValueError for a distance that is not positive, or a share outside of [0, 1).
     """
     lower, upper = bodies.bounding_box()

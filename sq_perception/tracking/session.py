@@ -30,15 +30,11 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import forms, state
+from sq_perception.tracking import association, state
 from sq_perception.tracking.state import LENGTH, Observed
 from sq_perception.tracking.tracker import Track, Tracker
 
 FIRST_FAILED_ID = 2**31
-_SPANNED = 1.2
-"""Measured points that span more than this share of a body's width are of a larger one, put in its place while nobody
-looked.  Of household things that stay, one in a hundred spans 1.03 of its track's body and more; of what took another
-one's place, and kept its id, up to 2.7.  Chosen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +85,7 @@ class TrackingSession:
 
     def reset(self) -> None:
         """Forget every body; ids go on."""
-        self._posed().reset()
+        self._tracker_of_poses().reset()
         self._stamp, self._pose = -np.inf, state.parse_pose(None)
         self.tally = replace(self.tally, tracks=0)
         self.tracks = ()
@@ -106,28 +102,21 @@ class TrackingSession:
     ) -> tuple[Followed, ...]:
         """The bodies of another frame, in the order of ``observed``.
 
-        Parameters
-        ----------
-        observed
-            Bodies in the optical frame, without failed ones.
-        stamp
-            Seconds; a stamp before the last one resets the session.
-        camera_pose
-            Camera in the world, as in :meth:`Tracker.update`; None: the camera is the world.
-        is_pose_known
-            False for a frame whose pose was wanted and is not known; ``camera_pose`` is then not looked at.
-        camera, depth
-            As in :meth:`Tracker.update`.
+        observed: Bodies in the optical frame, without failed ones.
+        stamp: Seconds; a stamp before the last one resets the session.
+        camera_pose: Camera in the world, as in :meth:`Tracker.update`; None: the camera is the world.
+        is_pose_known: False for a frame whose pose was wanted and is not known; ``camera_pose`` is then not looked at.
+        camera, depth: As in :meth:`Tracker.update`.
 
         Raises ValueError as :meth:`Tracker.update`; nothing has changed then, unless the stamp is before the last one.
         """
         rotation, position = state.parse_pose(camera_pose) if is_pose_known else self._pose
         is_back = stamp < self._stamp
         if is_back:
-            self._posed().reset()  # its own last frame, one with a pose, may be older
+            self._tracker_of_poses().reset()  # its own last frame, one with a pose, may be older
         if not is_pose_known and self._without_pose is None:
             self._without_pose = copy(self._tracker)
-        tracker = self._posed() if is_pose_known else self._without_pose or self._tracker
+        tracker = self._tracker_of_poses() if is_pose_known else self._without_pose or self._tracker
         tracks = tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
         resets, without_pose = self.tally.resets + is_back, self.tally.without_pose + (not is_pose_known)
         self.tally = Tally(len(tracks), tracker.births, resets, without_pose)
@@ -151,7 +140,7 @@ class TrackingSession:
             found.append(Followed(track.id, track.seen, is_fused, body, covariance))
         return tuple(found)
 
-    def _posed(self) -> Tracker:
+    def _tracker_of_poses(self) -> Tracker:
         """The tracker of frames with a pose, as it was before those without one, but for what these counted."""
         if self._without_pose is not None:
             self._tracker.take_counts(self._without_pose)
@@ -174,7 +163,10 @@ def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.nd
     shown = Superquadric.stack([each.superquadric for each in observed])
     spanned = shown.untapered().size * np.stack([each.seen for each in observed])
     wide = Superquadric.stack(bodies).support(np.swapaxes(shown.rotation_matrix, -1, -2))
-    return np.asarray((spanned > _SPANNED * wide).any(axis=-1))
+    # Measured points that span more than this share of a body's width are of a larger one, put in its place while
+    # nobody looked. Of household things that stay, one in a hundred spans 1.03 of its track's body and more; of what
+    # took another one's place, and kept its id, up to 2.7. Chosen.
+    return np.asarray((spanned > 1.2 * wide).any(axis=-1))
 
 
 def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
@@ -183,5 +175,5 @@ def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observe
     known = np.isfinite(own).all()
     given = own if known else np.zeros((LENGTH, LENGTH))
     seen = observation.superquadric.untapered().to_flat()
-    found, changed = forms.rename_axes(body.to_flat(), covariance, seen, given)
+    found, changed = association.rename_axes(body.to_flat(), covariance, seen, given)
     return Superquadric.from_flat(found), changed if known else own

@@ -20,10 +20,6 @@ DRIFT = states.diagonal(0.0, 0.0, 0.001, 0.01)
 """Random walk of a body at rest in a second: a millimetre, and 0.6 degrees.  Chosen."""
 CONFIRM_AFTER = 3
 """Observations until a track is confirmed: one more than may disagree by chance.  Chosen."""
-FORGET_POSE_AFTER = 5.0
-"""Seconds without observation until a body may be anywhere within reach.  Chosen."""
-_COASTING = 1.0
-"""Seconds that an unseen body is taken to go on as it was seen to move.  Chosen."""
 
 
 class TrackState(Enum):
@@ -104,14 +100,16 @@ class Body:
         """The body at a stamp, ``elapsed`` seconds after the frame before; not observed."""
         variance, estimate = np.diag(DRIFT) * elapsed, self.estimate
         state, velocity = estimate.state.copy(), self.velocity
-        if stamp - self.last > _COASTING:
+        # Seconds that an unseen body is taken to go on as it was seen to move. Chosen.
+        if stamp - self.last > 1.0:
             velocity = np.zeros(3)
         if velocity.any():
             step = velocity * elapsed
             state[5:8] += step
             variance[CENTRE] += step @ step  # hands speed up and stop
             variance[TURN] += HAND**2 * min(elapsed, 1.0)
-        if stamp - self.last > FORGET_POSE_AFTER:
+        # Seconds without observation until a body may be anywhere within reach. Chosen.
+        if stamp - self.last > 5.0:
             # Once: however many frames pass meanwhile, it cannot be forgotten more.
             variance[POSE] += np.maximum(HAND**2 - np.diag(estimate.covariance)[POSE], 0.0)
         return replace(

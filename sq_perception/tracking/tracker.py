@@ -3,12 +3,11 @@
 Observations come in the optical frame with the pose of the camera in the world; tracks live in the world.  A frame:
 
 1. Prediction: a body rests, with a slow drift, or keeps the velocity that it was seen to have.
-2. Association (:mod:`~sq_perception.tracking.association`), in the form that continues the track
-   (:mod:`~sq_perception.tracking.forms`).
-3. Fusion (:mod:`~sq_perception.tracking.fusion`) where both agree (:mod:`~sq_perception.tracking.gating`).  A single
-   observation that disagrees counts little.  After several in a row that disagree in the pose alone the body has moved,
-   its pose starts again, its sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too.
-   An answer that repeats an earlier one shows that a body at rest is still there, and no more.
+2. Association, in the form that continues the track (:mod:`~sq_perception.tracking.association`).
+3. Fusion (:mod:`~sq_perception.tracking.fusion`) where both agree.  A single observation that disagrees counts little.
+   After several in a row that disagree in the pose alone the body has moved, its pose starts again, its sizes and
+   exponents are kept.  Where they disagree otherwise, the track is doubted too.  An answer that repeats an earlier one
+   shows that a body at rest is still there, and no more.
 4. Birth: observations without a track start one; ids are never used again.
 5. Death: after some frames in a row in which a body should have been seen (:mod:`~sq_perception.tracking.visibility`)
    or another one was seen in its place.  Hidden bodies are kept for a while.
@@ -27,7 +26,7 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import association, fusion, gating, state, visibility
+from sq_perception.tracking import association, fusion, state, visibility
 from sq_perception.tracking.association import Pairs
 from sq_perception.tracking.fusion import Estimate, Observation
 from sq_perception.tracking.state import CENTRE, HAND, LENGTH, TURN, Observed
@@ -43,16 +42,11 @@ PREDICTED_SHARE = 0.6
 degrees about them, 90 instead of 84 % of the half sizes are within two deviations, of single frames 93 %."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
-_LEAST_WHITE = 1e-6
-"""Share of F that is new in every observation: of exact ones, such as a simulator's, S has no inverse without it."""
 UNKNOWN = 0.15, 0.2, 0.15, 0.2
 """Deviations (sizes as shares, exponents, centre as a share of the mean half size, turn) of observations without
 covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
-MISSES = 5
-"""Frames in a row that should have shown it after which a confirmed track dies; a tentative one after two.  Chosen: a
-sixth of a second at 30 Hz."""
 FORGET_AFTER = 30.0
 """Seconds without observation until a body is given up.  Chosen."""
 MOST = 100
@@ -73,11 +67,14 @@ class _Frame(NamedTuple):
 
     def observe(self, pairs: Pairs) -> Observation:
         """The parts of the errors of some observations, in the forms of their tracks."""
+        # Share of F that is new in every observation: of exact ones, such as a simulator's, S has no inverse without
+        # it.
+        least_white = 1e-6
         gamma, least = self.gamma[pairs.observed, None, None], _least(pairs.state)
         return Observation(
             pairs.state,
-            (1 - COMMON_SHARE - gamma) * pairs.covariance + _LEAST_WHITE * least,
-            COMMON_SHARE * pairs.covariance + (1 - _LEAST_WHITE) * least,
+            (1 - COMMON_SHARE - gamma) * pairs.covariance + least_white * least,
+            COMMON_SHARE * pairs.covariance + (1 - least_white) * least,
             gamma * pairs.covariance,
             self.direction[pairs.observed],
         )
@@ -262,11 +259,11 @@ def _see_again(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> tuple[_Bodies, P
     return tuple(after), pairs.at(~is_old)
 
 
-def _compare(bodies: _Bodies, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, gating.Agreement]:
+def _compare(bodies: _Bodies, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, association.Agreement]:
     """S (n, 11, 11), errors (n, 11) and agreement of what was observed against the tracks."""
     states, covariances = stack([bodies[k] for k in pairs.track])
     total, error = covariances + pairs.covariance + _least(states), state.difference(states, pairs.state)
-    return total, error, gating.compare(states[:, 0:3], total, error)
+    return total, error, association.compare(states[:, 0:3], total, error)
 
 
 def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
@@ -278,7 +275,7 @@ def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
     some, turning = _doubt(bodies, pairs, estimate.covariance, seen.white, whole, frame.stamp)
     estimate = fusion.update(estimate, seen, turning)
     after = list(bodies)
-    rest = gating.compare(estimate.state[:, 0:3], whole, state.difference(estimate.state, pairs.state))
+    rest = association.compare(estimate.state[:, 0:3], whole, state.difference(estimate.state, pairs.state))
     for k, body in enumerate(some):
         insists = body.disagreed >= PATIENCE and not rest.fits[k]
         after[pairs.track[k]] = replace(
@@ -311,8 +308,8 @@ def _doubt(
         is_out_of_patience = disagreed > 0 and (body.is_moving or disagreed >= PATIENCE)
         if not body.is_moving and body.jumps == 0:
             # What moves errs to the same side again; errors larger than their covariance do so seldom.
-            slid = slid and gating.same_side(body.last_error[CENTRE], error[k, CENTRE])
-            turned = turned and gating.same_side(body.last_error[TURN], error[k, TURN])
+            slid = slid and association.same_side(body.last_error[CENTRE], error[k, CENTRE])
+            turned = turned and association.same_side(body.last_error[TURN], error[k, TURN])
         if is_out_of_patience and verdict.fits[k] and (slid or turned):
             turning[k] = turned
             for part, has_moved in ((CENTRE, slid), (TURN, turned)):
@@ -372,7 +369,9 @@ def _survivors(bodies: _Bodies, missing: np.ndarray, stamp: float) -> _Bodies:
     for k, body in enumerate(bodies):
         if not seen[k]:
             missed = body.missed + 1 if missing[k] or ousted[k] else 0
-            patience = MISSES if body.seen >= CONFIRM_AFTER else 1 if ousted[k] else 2
+            # Frames in a row that should have shown it after which a confirmed track dies; a tentative one after two.
+            # Chosen: a sixth of a second at 30 Hz.
+            patience = 5 if body.seen >= CONFIRM_AFTER else 1 if ousted[k] else 2
             if missed >= patience or stamp - body.last > FORGET_AFTER:
                 continue
             body = replace(body, missed=missed)

@@ -17,9 +17,6 @@ from sq_perception.imaging import hole_filling
 from sq_perception.imaging.camera import Camera
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
-_TOLERANCE = 0.25
-"""Share of the smallest half size by which depths differ that are the body's own.  Chosen: above noise and misfit,
-below a thing that stands behind."""
 
 
 def is_missing(
@@ -52,7 +49,9 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     measured = _readings(depth[row, column].astype(float), camera)
     if (inside & ~np.isfinite(measured)).any():  # perhaps a gap between readings of one surface
         measured = hole_filling.fill(_readings(depth, camera))[0][row, column].astype(float)
-    tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
+    # Share of the smallest half size by which depths differ that are the body's own. Chosen: above noise and misfit,
+    # below a thing that stands behind.
+    tolerance = 0.25 * bodies.size.min(axis=-1)[:, None]
     behind = np.where(inside & np.isfinite(measured), measured, -np.inf) - points[..., 2]
     clear, observed = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)
     return clear / np.maximum(observed, 1)

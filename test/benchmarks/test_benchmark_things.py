@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric, metrics, rotation
 from sq_perception.geometry.mesh import mesh
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])

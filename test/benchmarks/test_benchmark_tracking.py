@@ -8,7 +8,7 @@ import tracking
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import Superquadric, rotation
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
-from sq_perception.tracking.forms import TURNS
+from sq_perception.tracking.association import TURNS
 
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
 

@@ -13,11 +13,10 @@ import pytest
 import torch
 
 from sq_perception.commands import main
-from sq_perception.evaluation import contest, evaluation_pictures, thesis_images, thesis_tables
-from sq_perception.evaluation.contest import Answers, fit, network, unique_names
+from sq_perception.evaluation import contest, evaluation_pictures, thesis_report
+from sq_perception.evaluation.contest import CAMERA, Answers, ThesisImages, fit, network, unique_names
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, shortest_arc
-from sq_perception.evaluation.thesis_images import CAMERA, ThesisImages
-from sq_perception.evaluation.thesis_tables import NOT_IN_THESIS, NOTHING, Table
+from sq_perception.evaluation.thesis_report import NOT_IN_THESIS, NOTHING, Table
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -132,7 +131,7 @@ class TestImages:
 
     def test_chunks_hold_every_image_once_in_8_bits(self, monkeypatch: pytest.MonkeyPatch) -> None:
         images = ThesisImages(5)
-        monkeypatch.setattr(thesis_images, "CHUNK", 2)
+        monkeypatch.setattr(contest, "CHUNK", 2)
         chunks = list(images.chunks())
         assert [(first, len(depth)) for first, depth in chunks] == [(0, 2), (2, 2), (4, 1)]
         np.testing.assert_array_equal(chunks[1][1][1], images.image(3))
@@ -153,7 +152,7 @@ class TestContest:
         alone, classic = network(checkpoint.resolve()), fit("classic")
         results = []
         for chunk in (2, 7):
-            monkeypatch.setattr(thesis_images, "CHUNK", chunk)
+            monkeypatch.setattr(contest, "CHUNK", chunk)
             results.append(contest.compare([(alone, 7), (classic, 4)], ThesisImages(7)))
         for small, large in zip(*results, strict=True):
             np.testing.assert_allclose(small.bodies.to_flat(), large.bodies.to_flat(), atol=1e-4)
@@ -205,7 +204,7 @@ class TestContest:
 
 class TestTables:
     def test_every_table_of_the_thesis_is_there_and_says_where_there_is_nothing(self) -> None:
-        tables = thesis_tables.thesis_tables([])
+        tables = thesis_report.thesis_tables([])
         titles = " ".join(table.title for table in tables)
         assert all(f"Table {number}" in titles for number in ("6.1", "6.2", "6.3", "7.1", "7.2", "7.3", "7.4"))
         for table in tables:
@@ -221,7 +220,7 @@ class TestTables:
             entry("classic", None, iou_mean=0.7),
             entry("auto", None, iou_mean=0.99),
         ]
-        tables = {table.title.split(":")[0]: table for table in thesis_tables.thesis_tables(results)}
+        tables = {table.title.split(":")[0]: table for table in thesis_report.thesis_tables(results)}
         rows = {row[0]: row for row in tables["Table 7.4"].rows}
         assert rows["supervised, L_OC"][1:4] == ("shipped", "90.00 ± 0.00 %", "94.62 ± 3.18 %")
         assert rows["Iterative (Solina and Bajcsy)"][1:4] == ("classic", "70.00 ± 0.00 %", "84.51 ± 8.89 %")
@@ -229,18 +228,18 @@ class TestTables:
         assert rows["unsupervised, L_LS"][1] == NOTHING
         assert rows["supervised, L_OC"][4] == "not timed"
         assert not any("auto" in row for table in tables.values() for row in table.rows)
-        assert [len(table.rows) for table in thesis_tables.overview(results)] == [4, 4]
+        assert [len(table.rows) for table in thesis_report.overview(results)] == [4, 4]
 
     def test_two_networks_of_one_loss_are_two_rows(self) -> None:
         results = [entry(name, "render") for name in ("first", "second")]
-        (table,) = (one for one in thesis_tables.thesis_tables(results) if one.title.startswith("Table 7.2"))
+        (table,) = (one for one in thesis_report.thesis_tables(results) if one.title.startswith("Table 7.2"))
         assert [row[1] for row in table.rows if row[0].endswith("L_DR")] == ["first", "second"]
 
     def test_cells_are_escaped(self) -> None:
         assert "a\\|L_OC" in Table("t", ("Method",), (("a|L_OC",),)).markdown()
 
     def test_no_minus_zero(self) -> None:
-        assert thesis_tables.signed(-1e-6) == "+0.00 %"
+        assert thesis_report.signed(-1e-6) == "+0.00 %"
 
 
 def test_examples_are_chosen_by_rank() -> None:

@@ -11,7 +11,7 @@ from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.options import MODEL_ERROR, FitOptions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 
 CAN = (0.035, 0.035, 0.06), (0.1, 1.0)
 BALL = (0.04, 0.04, 0.04), (1.0, 1.0)

@@ -19,7 +19,7 @@ from sq_perception.fitting.rays import RAY_COLUMNS, Rays
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import plane_depth

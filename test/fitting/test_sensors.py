@@ -15,7 +15,7 @@ def lone_body_on_a_table(seed: int, sensor: str) -> tuple[scenes.Scene, np.ndarr
     rng = np.random.default_rng(seed)
     scene = scenes.table_scene(rng, 1)
     depth, labels = scene.render()
-    return scene, sensor_noise.preset(sensor).measured(depth, scene.camera, rng), labels == 1
+    return scene, sensor_noise.preset(sensor).measure(depth, scene.camera, rng), labels == 1
 
 
 def test_edges_that_a_time_of_flight_camera_mixes_do_not_make_a_body_sure_of_a_wrong_size() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from xml.etree import ElementTree
-
 import numpy as np
 import pytest
 import trimesh
@@ -82,27 +80,6 @@ def test_other_formats_keep_the_coordinates(tmp_path, suffix):
     assert scene.to_mesh().volume == pytest.approx(expected.volume, rel=1e-4)
 
 
-def test_a_dae_has_named_bodies_upright_in_their_colours(tmp_path):
-    """Read by the rules of COLLADA: accessors of floats, triangles of indices, materials by reference."""
-    bodies = [body(seed=1), body(size=(0.3, 0.1, 0.1), seed=2)]
-    path = export(bodies, tmp_path / "bodies.dae", names=["a <b>", "c"])
-    names = {"c": "http://www.collada.org/2005/11/COLLADASchema"}
-    root = ElementTree.parse(path).getroot()  # noqa: S314 - of our own file
-    assert root.findtext("c:asset/c:up_axis", namespaces=names) == "Y_UP"
-    nodes = root.findall(".//c:visual_scene/c:node", names)
-    assert [node.get("name") for node in nodes] == ["a <b>", "c"]
-    for k, (node, one) in enumerate(zip(nodes, bodies, strict=True)):
-        target = node.find("c:instance_geometry", names).get("url")
-        shape = next(g for g in root.iter(f"{{{names['c']}}}geometry") if f"#{g.get('id')}" == target)
-        points = np.array(shape.findtext(".//c:float_array", namespaces=names).split(), float).reshape(-1, 3)
-        faces = np.array(shape.findtext(".//c:p", namespaces=names).split(), int).reshape(-1, 3)
-        read = trimesh.Trimesh(points * [1, -1, -1], faces)
-        assert read.volume == pytest.approx(float(one.volume()), rel=0.02), "outwards, at its size"
-        np.testing.assert_allclose(read.bounds.mean(axis=0), one.translation, atol=1e-3)
-        colour = root.findall(".//c:diffuse/c:color", names)[k].text.split()
-        np.testing.assert_allclose(np.array(colour[:3], float), COLOURS[k], atol=1e-4)
-
-
 def test_sampled_points_are_on_the_surface_and_the_same_for_a_seed():
     points = sample(body(), 200)
     np.testing.assert_allclose(body().gauge(points), 1, atol=1e-9)
@@ -115,7 +92,7 @@ def test_misuse_is_refused(tmp_path):
         mesh(body(), 10)
     with pytest.raises(ValueError, match="single body"):
         mesh(Superquadric.stack([body(), body()]))
-    with pytest.raises(ValueError, match=r"\.glb, \.ply, \.stl, \.obj, \.dae"):
+    with pytest.raises(ValueError, match=r"\.glb, \.ply, \.stl, \.obj"):
         export(body(), tmp_path / "body.off")
     with pytest.raises(ValueError, match="no body"):
         export([], tmp_path / "none.glb")

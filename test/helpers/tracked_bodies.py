@@ -11,7 +11,7 @@ from sq_perception.fitting import covariance as fit_covariance
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import forms, gating, state, track, tracker
+from sq_perception.tracking import association, state, track, tracker
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
@@ -34,7 +34,7 @@ def nothing_but_the_covariances(patch, common, lasting):
         (track, "DRIFT", nought),
         (tracker, "COMMON_SHARE", common),
         (tracker, "LASTING_SHARE", lasting),
-        (gating, "LIMITS", {freedom: chi2.ppf(1 - 1e-9, freedom) for freedom in gating.LIMITS}),
+        (association, "LIMITS", {freedom: chi2.ppf(1 - 1e-9, freedom) for freedom in association.LIMITS}),
     ):
         patch.setattr(module, name, value)
     return tracker.Tracker()
@@ -80,8 +80,8 @@ def draw(truth, covariance, rng, form=None, error=None):
 
 def exchanged(seen, turn):
     """What a fit finds that chose another axis as z: one of the 16 forms that are no exact ones."""
-    flat = forms.candidates(seen.superquadric.to_flat())[turn]
-    change = forms._CHANGES[turn]
+    flat = association.candidates(seen.superquadric.to_flat())[turn]
+    change = association._CHANGES[turn]
     return Seen(Superquadric.from_flat(flat), change @ seen.covariance @ change.T + 1e-6 * np.eye(11))
 
 
@@ -105,9 +105,10 @@ def looking_at(target, direction, distance):
 
 def error_of(track, truth):
     """Error of a track in the truth's nearest form, and its covariance, in shares of the true sizes."""
-    exact = forms.candidates(track.superquadric.to_flat())[: forms.EXACT]
+    exact = association.candidates(track.superquadric.to_flat())[: association.EXACT]
     errors = state.difference(truth.to_flat(), exact)
-    changed = forms._CHANGES[: forms.EXACT] @ track.covariance @ forms._CHANGES[: forms.EXACT].swapaxes(-1, -2)
+    changes = association._CHANGES[: association.EXACT]
+    changed = changes @ track.covariance @ changes.swapaxes(-1, -2)
     best = np.argmin(state.mahalanobis(changed + 1e-9 * np.eye(11), errors))
     error, known = errors[best], changed[best]
     return np.r_[error[:3] / truth.size, error[3:]], state.scale_sizes(known, 1 / truth.size)

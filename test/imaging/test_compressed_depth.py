@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from packed_depth import pack
 
-from sq_perception.imaging import compressed_depth, rvl
+from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.depth_units import metres
 
 
@@ -91,7 +91,7 @@ def test_rvl_comes_back(rng, share):
     grey = np.where(rng.random((48, 64)) < share, 0, rng.integers(1, 2**16, (48, 64))).astype(np.uint16)
     data = rvl_message(grey)
     assert compressed_depth.size("16UC1; compressedDepth rvl", data) == (64, 48)
-    np.testing.assert_array_equal(rvl.decode(data[20:], 64, 48), grey)
+    np.testing.assert_array_equal(compressed_depth.decode_rvl(data[20:], 64, 48), grey)
     found = compressed_depth.decode("16UC1; compressedDepth rvl", data)
     np.testing.assert_array_equal(found, grey)
 

@@ -83,7 +83,7 @@ def test_what_stands_in_for_missing_lines_shifts_no_body(first: int) -> None:
 def test_pixels_of_a_body_are_those_that_were_measured() -> None:
     """Also where some of its segment are outliers, as the rim is that a sensor adds."""
     scene = scenes.table_scene(np.random.default_rng(3), 3)
-    depth = sensor_noise.preset("realsense_d435").measured(scene.render()[0], scene.camera, np.random.default_rng(4))
+    depth = sensor_noise.preset("realsense_d435").measure(scene.render()[0], scene.camera, np.random.default_rng(4))
     depth[1::2] = np.nan
     frame = Recoverer().recover(depth, scene.camera)
     assert len(frame.bodies) == 3

@@ -21,23 +21,11 @@ from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.learning.train import recalibrate, train, validate
 from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.simulation import view_rendering
-from sq_perception.simulation.scenes import thesis_bodies
 
 SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 
 
 class TestData:
-    def test_bodies_follow_the_protocol(self) -> None:
-        bodies = thesis_bodies(4000, np.random.default_rng(3))
-        for values, low, high in (
-            (bodies.size * 255, 25, 75),
-            (bodies.shape, 0.1, 1.0),
-            (bodies.translation * 255, 88, 168),
-        ):
-            assert low <= values.min() < low + 0.01 * high
-            assert high - 0.01 * high < values.max() <= high
-            np.testing.assert_allclose(values.mean(axis=0), (low + high) / 2, rtol=0.03)
-
     def test_pool_pairs_views_with_their_bodies(self) -> None:
         pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)
         images, bodies = pool.batch(16)
@@ -101,21 +89,13 @@ class TestNetwork:
 class TestTraining:
     CONFIG = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
 
-    def test_learns_and_goes_on_after_a_kill(self, tmp_path: Path) -> None:
+    def test_learns(self, tmp_path: Path) -> None:
         views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
         before = validate(Regressor(SMALL), views, truth).mean()
         model = train(self.CONFIG, tmp_path / "whole", SMALL)
         assert validate(model, views, truth).mean() > before + 0.05
         records = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
         assert [r["step"] for r in records] == [20, 40]
-
-        state = tmp_path / "whole" / "state.safetensors"
-        longer = TrainingConfig(**{**vars(self.CONFIG), "steps": 60})
-        train(longer, tmp_path / "whole", SMALL)
-        records = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
-        assert [r["step"] for r in records] == [20, 40, 60]
-        assert records[1]["seconds"] < records[2]["seconds"]
-        assert int(load_file(str(state))["step"]) == 60
 
     @pytest.mark.parametrize("loss", ["dual", "render"])
     def test_labels_go_to_the_losses_that_need_them_and_to_no_other(

@@ -12,7 +12,7 @@ from unit_axis import cell_centres, grid, soft_images
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
-from sq_perception.imaging import sight_lines
+from sq_perception.imaging import soft_render
 from sq_perception.learning import losses
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 from sq_perception.learning.losses import Objective
@@ -144,20 +144,6 @@ class TestLeastSquares:
         assert losses.free_space_loss(wide, lines, depth).item() > 0.01
 
 
-class TestTau:
-    def test_a_training_takes_its_own_unless_another_is_given(self) -> None:
-        """7.10: D = n tau, in units of s."""
-        guess = tensors(thesis_bodies(2, np.random.default_rng(5)))
-        view = torch.zeros(2, 1, 16, 16, dtype=DOUBLE)
-
-        def loss(**given: float) -> torch.Tensor:
-            objective = Objective("render", sharpness_start=20.0, sharpness_end=20.0, **given)
-            return objective.loss(guess, view, None, 0.0, torch.Generator().manual_seed(1))
-
-        torch.testing.assert_close(loss(), loss(tau=2.0))
-        assert not torch.allclose(loss(), loss(tau=0.5))
-
-
 class TestRenderLoss:
     def test_hand_computed(self) -> None:
         """A body that no line meets renders to 0, and the loss is the mean of the image."""
@@ -169,7 +155,7 @@ class TestRenderLoss:
         images, bodies = render_views(thesis_bodies(4, np.random.default_rng(4)), 48)
         view = torch.tensor(images).double()
         guess = tensors(Superquadric(bodies.size * 1.2, bodies.shape, bodies.translation, bodies.rotation))
-        lines, depth = sight_lines.of_view(view)
+        lines, depth = soft_render.of_view(view)
         voxels = voxel_loss(guess, view, 20.0, 40 / 48)
         limit = losses.render_loss(guess, lines, depth, 20.0, 40.0)
         torch.testing.assert_close(voxels, limit, rtol=0.05, atol=0)

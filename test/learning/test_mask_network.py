@@ -16,7 +16,6 @@ from sq_perception.commands import main
 from sq_perception.files import output_file
 from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
 from sq_perception.learning import checkpoint, shard_training
-from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.network_config import MaskConfig
 from sq_perception.learning.networks import MaskNetwork
 from sq_perception.learning.training_config import MASK_RUN
@@ -53,19 +52,16 @@ def test_every_cell_has_a_logit(config: MaskConfig) -> None:
     assert MaskNetwork(config)(torch.zeros(2, CHANNELS, side, side)).shape == (2, side, side)
 
 
-def test_a_training_learns_goes_on_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
+def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
     subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
     config = replace(MASK_RUN, minutes=0.1, batch=8, threads=1, held=1, validation=5)
-    first = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    network = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert records[-1]["outliers"] == pytest.approx(1, abs=0.1)
     assert records[-1]["left"] < records[-1]["outliers"]
-    shard_training.train(subject, replace(config, minutes=0.12), tmp_path / "views", tmp_path / "run")
-    more = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert more[len(records)]["step"] > records[-1]["step"]
     again = checkpoint.load_masks(tmp_path / "run" / "masks.safetensors")
-    assert again.config == SMALL == first.config
+    assert again.config == SMALL == network.config
 
 
 def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
@@ -195,12 +191,6 @@ def test_commands_draw_on_one_thread_as_a_process_a_core_may(command, monkeypatc
     assert main.main([command, str(tmp_path)]) == 0
     assert found == [1]
     assert numba.get_num_threads() == before
-
-
-def test_weights_of_another_kind_are_refused() -> None:
-    with pytest.raises(CheckpointError, match=r"sq_perception\.masks"):
-        checkpoint.load_masks("robust")
-    assert "masks" not in checkpoint.shipped_regressors()
 
 
 def test_the_shipped_network_finds_outliers_in_scenes_that_it_has_not_seen() -> None:

@@ -8,7 +8,7 @@ import torch
 from unit_axis import cell_centres
 
 from sq_perception.geometry import Superquadric
-from sq_perception.imaging import sight_lines, soft_render, unit_cube
+from sq_perception.imaging import soft_render, unit_cube
 from sq_perception.simulation.scenes import thesis_bodies
 from sq_perception.simulation.view_rendering import render_views
 
@@ -30,9 +30,9 @@ def test_gradients_are_finite_on_axes(shape: float, sharpness: float | None) -> 
     steps = torch.linspace(0, 1, 11, dtype=torch.float64)
     lines, body = torch.cartesian_prod(steps, steps), Superquadric.from_flat(flat)
     if sharpness is None:
-        image = sight_lines.free_space_excess(body, lines, lines.new_zeros(1, 121))
+        image = soft_render.free_space_excess(body, lines, lines.new_zeros(1, 121))
     else:
-        image = sight_lines.soft_depth(body, lines, sharpness, 2 * sharpness)
+        image = soft_render.soft_depth(body, lines, sharpness, 2 * sharpness)
     image.sum().backward()
     assert torch.isfinite(flat.grad).all()
     assert torch.isfinite(image).all()
@@ -43,13 +43,13 @@ def test_gradients_are_finite_on_axes(shape: float, sharpness: float | None) -> 
 class TestLines:
     def test_pixels_lie_where_the_canonical_view_says(self) -> None:
         view = torch.arange(16.0).reshape(1, 4, 4)
-        lines, values = sight_lines.of_view(view, 2, row=1, column=0)
+        lines, values = soft_render.of_view(view, 2, row=1, column=0)
         assert values.tolist() == [[4, 6, 12, 14]]
         assert lines.tolist() == [[0.125, 0.625], [0.625, 0.625], [0.125, 0.125], [0.625, 0.125]]
 
     def test_pixels_of_full_frames_lie_where_the_camera_of_the_cube_has_them(self) -> None:
         camera = unit_cube.camera(5)
-        lines, _ = sight_lines.of_view(torch.zeros(1, 5, 5), framing="full")
+        lines, _ = soft_render.of_view(torch.zeros(1, 5, 5), framing="full")
         v, u = np.indices((5, 5)).reshape(2, -1)
         points = camera.unproject(u, v, np.full(25, 0.5))
         expected = np.stack([points[:, 0], 1 - points[:, 1]], axis=1)
@@ -65,13 +65,13 @@ class TestLines:
         lateral = lines - ellipsoids.translation[:, None, :2]
         z = ellipsoids.translation[:, 2:] - (lateral * m[:, None, 2, :2]).sum(-1) / m[:, 2:, 2]
         inside_extent = (z - ellipsoids.translation[:, 2:]).abs() < ellipsoids.support(lines.new_tensor([[0, 0, 1.0]]))
-        found = sight_lines.nearest_approach(ellipsoids, lines)
+        found = soft_render.nearest_approach(ellipsoids, lines)
         np.testing.assert_allclose(found[inside_extent], z[inside_extent], atol=1e-9)
 
     def test_lines_miss_where_the_ray_caster_says_so(self) -> None:
         images, bodies = views(20, 1)
-        lines, depth = sight_lines.of_view(images)
-        least = sight_lines.gauge(bodies, lines, sight_lines.nearest_approach(bodies, lines))
+        lines, depth = soft_render.of_view(images)
+        least = soft_render.gauge(bodies, lines, soft_render.nearest_approach(bodies, lines))
         assert ((least < 1) != (depth > 0)).float().mean() < 1e-3
 
 
@@ -88,14 +88,14 @@ class TestFreeSpace:
     )
     def test_hand_computed_on_a_sphere(self, x: float, end: float, excess: float) -> None:
         line = torch.tensor([[x, 0.5]], dtype=torch.float64)
-        found = sight_lines.free_space_excess(SPHERE, line, torch.tensor([[end]], dtype=torch.float64))
+        found = soft_render.free_space_excess(SPHERE, line, torch.tensor([[end]], dtype=torch.float64))
         assert found.item() == pytest.approx(excess, abs=1e-3)
 
     def test_gradcheck(self) -> None:
         images, bodies = views(2, 2)
-        lines, depth = sight_lines.of_view(images, 8)
+        lines, depth = soft_render.of_view(images, 8)
         assert torch.autograd.gradcheck(
-            lambda flat: sight_lines.free_space_excess(Superquadric.from_flat(flat), lines, depth),
+            lambda flat: soft_render.free_space_excess(Superquadric.from_flat(flat), lines, depth),
             (bodies.to_flat() + 0.05).requires_grad_(),
         )
 
@@ -104,7 +104,7 @@ class TestSoftDepth:
     def test_is_the_limit_of_fine_voxels_with_its_gradient(self, s: float, density: float) -> None:
         voxels = 2000
         images, bodies = views(6, 3)
-        lines, _ = sight_lines.of_view(images, 5, 2, 2)
+        lines, _ = soft_render.of_view(images, 5, 2, 2)
         z = cell_centres(voxels).flip(0)
         points = torch.cat(
             [lines[:, None].expand(-1, voxels, 2), z[None, :, None].expand(len(lines), -1, 1)], dim=-1
@@ -116,7 +116,7 @@ class TestSoftDepth:
             return soft_render.depth_projection(occupancy, density / voxels)
 
         def limit(body: Superquadric) -> torch.Tensor:
-            return sight_lines.soft_depth(body, lines, s, density, 12)
+            return soft_render.soft_depth(body, lines, s, density, 12)
 
         found, gradients = [], []
         for render in (voxel_depth, limit):
@@ -130,16 +130,16 @@ class TestSoftDepth:
 
     def test_approaches_the_exact_image(self) -> None:
         images, bodies = views(10, 4)
-        lines, depth = sight_lines.of_view(images)
-        errors = [(sight_lines.soft_depth(bodies, lines, s, 2 * s) - depth).abs().mean() for s in (25, 100, 400)]
+        lines, depth = soft_render.of_view(images)
+        errors = [(soft_render.soft_depth(bodies, lines, s, 2 * s) - depth).abs().mean() for s in (25, 100, 400)]
         assert errors[0] > 3 * errors[1] > 9 * errors[2]
         assert errors[2] < 0.003
 
     def test_nothing_seen_is_zero(self) -> None:
         away = torch.tensor([[0.05, 0.95]], dtype=torch.float64)
-        assert sight_lines.soft_depth(SPHERE, away, 100.0, 200.0).item() == pytest.approx(0, abs=1e-9)
+        assert soft_render.soft_depth(SPHERE, away, 100.0, 200.0).item() == pytest.approx(0, abs=1e-9)
 
     @pytest.mark.parametrize(("s", "density", "cells"), [(0.0, 1.0, 8), (1.0, -1.0, 8), (1.0, 1.0, 0)])
     def test_refuses_nonsense(self, s: float, density: float, cells: int) -> None:
         with pytest.raises(ValueError, match="positive"):
-            sight_lines.soft_depth(SPHERE, torch.zeros(1, 2, dtype=torch.float64), s, density, cells)
+            soft_render.soft_depth(SPHERE, torch.zeros(1, 2, dtype=torch.float64), s, density, cells)

@@ -16,7 +16,7 @@ from scipy.stats import multivariate_t
 from sq_perception.commands import main
 from sq_perception.geometry.rotation import random
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
+from sq_perception.geometry.union import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, networks, shard_training
 from sq_perception.learning.inference import ThingPredictor
@@ -147,6 +147,8 @@ def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
         checkpoint.load(path)
     with pytest.raises(checkpoint.CheckpointError, match="expected a header"):
         checkpoint.load_things("robust")
+    with pytest.raises(checkpoint.CheckpointError, match=r"sq_perception\.masks"):
+        checkpoint.load_masks("robust")
 
 
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator) -> None:

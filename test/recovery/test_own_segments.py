@@ -92,7 +92,7 @@ def test_the_rim_that_a_stereo_camera_adds_is_an_outlier(shipped: Any) -> None:
     counts = np.zeros((2, 2))  # before, after; of the can, beside it
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        measured = sensor_noise.preset("realsense_d435").measured(depth.astype(float), CAMERA, rng)
+        measured = sensor_noise.preset("realsense_d435").measure(depth.astype(float), CAMERA, rng)
         can = wider & (np.abs(measured - np.median(depth[truth > 0])) < CAN[0][0])
         found = of(shipped, measured).improved(segmentation(can.astype(np.int32)))
         np.testing.assert_array_equal(found.labels, can)

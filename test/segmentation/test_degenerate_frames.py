@@ -170,7 +170,7 @@ ROOMS = (
 
 
 def seen(kind: str, sensor: str, seed: int = 3, camera: Camera = CAMERA) -> Frame:
-    depth = sensor_noise.preset(sensor).measured(room(kind, camera), camera, np.random.default_rng(seed))
+    depth = sensor_noise.preset(sensor).measure(room(kind, camera), camera, np.random.default_rng(seed))
     return Frame(depth, camera, TABLE if "table" in kind else None)
 
 

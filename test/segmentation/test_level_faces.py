@@ -22,7 +22,7 @@ def far_table():
 
 def sensed(table, bodies, sensor, seed):
     depth, truth = table.see(bodies)
-    measured = sensor_noise.preset(sensor).measured(depth.astype(float), VGA, np.random.default_rng(seed))
+    measured = sensor_noise.preset(sensor).measure(depth.astype(float), VGA, np.random.default_rng(seed))
     return measured.astype(np.float32), truth
 
 

@@ -18,7 +18,7 @@ CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 
 def sensed(table, bodies, sensor, seed):
     depth, truth = table.see(bodies)
-    measured = sensor_noise.preset(sensor).measured(depth.astype(float), VGA, np.random.default_rng(seed))
+    measured = sensor_noise.preset(sensor).measure(depth.astype(float), VGA, np.random.default_rng(seed))
     return measured.astype(np.float32), truth
 
 

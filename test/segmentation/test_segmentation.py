@@ -224,7 +224,7 @@ def test_a_low_camera_finds_what_stands_before_a_wall_that_fills_most_of_the_ima
     table = table_depth(camera, np.append(up, 0.13))
     rendered, index = raycast.render(Superquadric.stack(bodies), camera)
     room = np.minimum(np.where(table < edge, table, wall), rendered).astype(np.float32)
-    depth = sensor_noise.preset("kinect_v1").measured(room, camera, np.random.default_rng(0))
+    depth = sensor_noise.preset("kinect_v1").measure(room, camera, np.random.default_rng(0))
     found = segment(depth, camera)
     assert found.plane is not None
     assert found.plane[:3] @ up > 0.99

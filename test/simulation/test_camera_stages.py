@@ -62,12 +62,12 @@ def test_the_temporal_filter_weighs_frames_and_holds_readings() -> None:
 
 def test_a_decimated_plane_is_that_of_the_decimated_camera() -> None:
     """The median of an affine w over 3 x 3 pixels is that of the middle one; a missing reading does not count."""
-    small = stages.decimated_camera(CAMERA, 3)
+    small = stages.decimate_camera(CAMERA, 3)
     image = plane()
-    np.testing.assert_allclose(stages.decimated(image, 3), plane_depth(PLANE, small), rtol=1e-6)
+    np.testing.assert_allclose(stages.decimate(image, 3), plane_depth(PLANE, small), rtol=1e-6)
     image[::3, ::3] = NAN
-    assert np.isfinite(stages.decimated(image, 3)).all()
-    assert np.isnan(stages.decimated(np.full((4, 4), np.float32(NAN)), 2)).all()
+    assert np.isfinite(stages.decimate(image, 3)).all()
+    assert np.isnan(stages.decimate(np.full((4, 4), np.float32(NAN)), 2)).all()
 
 
 def test_a_ring_is_as_wide_as_asked_for_on_both_sides() -> None:
@@ -88,7 +88,7 @@ def test_gaps_are_filled_by_the_rule(rule: Filling, expected: float) -> None:
     image = np.full((5, 6), np.float32(1.0))
     image[3:] = 1.2
     image[2, 2:4] = NAN
-    found = stages.filled(image, rule)
+    found = stages.fill(image, rule)
     np.testing.assert_allclose(found[2, 2:4], expected)
     assert np.isfinite(found).all()
 
@@ -97,7 +97,7 @@ def test_gaps_are_filled_by_the_rule(rule: Filling, expected: float) -> None:
 def test_alignment_shifts_by_the_disparity_and_leaves_a_shadow(whole: bool) -> None:
     """Surfaces at 0.5 and 1 m, 2 and 1 pixels of disparity for a baseline of 10 mm: a pixel is covered, or missing."""
     for x, lost in ((0.01, 0), (-0.01, 1)):
-        found = stages.aligned(step(0.5, 1.0), CAMERA, np.array([x, 0.0, 0.0]), CAMERA, whole)
+        found = stages.align(step(0.5, 1.0), CAMERA, np.array([x, 0.0, 0.0]), CAMERA, whole)
         edge = 45 + round(100 * x / 0.5)
         assert found[30, edge - 1] == pytest.approx(0.5)
         assert np.count_nonzero(np.isnan(found[30, 5:-5])) == lost
@@ -106,23 +106,23 @@ def test_alignment_shifts_by_the_disparity_and_leaves_a_shadow(whole: bool) -> N
 
 def test_alignment_keeps_planes_and_points_leave_gaps_in_finer_images() -> None:
     finer = Camera(180, 120, 200.0, 200.0, 89.5, 59.5)
-    whole, points = (stages.aligned(plane(), CAMERA, np.zeros(3), finer, each) for each in (True, False))
+    whole, points = (stages.align(plane(), CAMERA, np.zeros(3), finer, each) for each in (True, False))
     assert np.isfinite(whole).all()
     assert np.isfinite(points).mean() == pytest.approx(0.25)
     true = plane_depth(PLANE, finer)
     known = np.isfinite(points)
     np.testing.assert_allclose(points[known], true[known], rtol=0.01)  # half a pixel away
-    same = stages.aligned(plane(), CAMERA, np.zeros(3), CAMERA, True)
+    same = stages.align(plane(), CAMERA, np.zeros(3), CAMERA, True)
     np.testing.assert_array_equal(same, plane())
 
 
 def test_bending_keeps_the_middle_and_grows_with_the_square() -> None:
     at = np.array([0.1, 0.0])
-    found = stages.bent(step(1.0, 1.0), CAMERA, at, np.zeros(2), 0.02)
+    found = stages.bend(step(1.0, 1.0), CAMERA, at, np.zeros(2), 0.02)
     x = (np.arange(90) - CAMERA.cx) / CAMERA.fx - 0.1
     y = (29 - CAMERA.cy) / CAMERA.fy
     np.testing.assert_allclose(found[29] - 1, 0.02 * (x * x + y * y), atol=1e-6)
-    tilted = stages.bent(step(1.0, 1.0), CAMERA, at, np.array([0.02, 0.0]), 0.0)
+    tilted = stages.bend(step(1.0, 1.0), CAMERA, at, np.array([0.02, 0.0]), 0.0)
     np.testing.assert_allclose(tilted[29] - 1, 0.02 * x, atol=1e-6)
 
 
@@ -130,7 +130,7 @@ def test_rounding_medians_and_blocks_stay_near_and_keep_gaps() -> None:
     image = plane()
     image[10:20, 10:20] = NAN
     known = np.isfinite(image)
-    found = stages.rounded(image, 0.01)
+    found = stages.round_depth(image, 0.01)
     assert np.abs(found - image)[known].max() <= 0.0051
     np.testing.assert_array_equal(np.isfinite(found), known)
     assert np.isnan(stages.median(image, 5)[12:18, 12:18]).all()
@@ -150,10 +150,10 @@ def test_cameras_are_drawn_from_the_ranges_and_one_without_stages_changes_nothin
     assert {each.rounds for each in drawn} == set(range(RANGES.rounds[1] + 1))
     assert all(abs(each.beside) <= RANGES.baseline[1] for each in drawn)
     image, mask = plane(), np.zeros((60, 90), bool)
-    np.testing.assert_array_equal(Stages().processed(image, mask, CAMERA), image)
+    np.testing.assert_array_equal(Stages().process(image, mask, CAMERA), image)
     mask[20:40, 30:50] = True
     for each in drawn[:40]:
-        found = each.processed(image, mask, CAMERA)
+        found = each.process(image, mask, CAMERA)
         inside = found[24:36, 34:46]
         assert np.isfinite(inside).mean() > 0.9
         assert np.nanmax(np.abs(inside / image[24:36, 34:46] - 1)) < 0.02

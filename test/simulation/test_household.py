@@ -7,8 +7,7 @@ import pytest
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.geometry.union import flat_support, move, support_of_union
+from sq_perception.geometry.union import DIRECTIONS, flat_support, move, support_of_union
 from sq_perception.simulation.household import KINDS, draw_thing
 
 MEASURES = {

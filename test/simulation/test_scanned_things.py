@@ -11,7 +11,7 @@ import trimesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import mesh
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning.shard_training import THINGS, read_views, write_views

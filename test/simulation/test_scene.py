@@ -1,4 +1,4 @@
-"""Scenes: what is drawn obeys its protocol, rests on its plane and is seen where it lies."""
+"""Scenes: what is drawn obeys its protocol, rests on its plane and is seen where it lies; crowds touch."""
 
 from __future__ import annotations
 
@@ -8,17 +8,26 @@ import pytest
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.scenes import Scene, plane_depth, table_scene, thesis_scene
+from sq_perception.segmentation.segments import segment
+from sq_perception.simulation import scenes, sensor_noise
+from sq_perception.simulation.scenes import Scene, plane_depth, table_scene, thesis_bodies, thesis_scene
+
+
+def test_bodies_of_the_thesis_fill_the_ranges_of_its_protocol():
+    bodies = thesis_bodies(4000, np.random.default_rng(3))
+    for values, low, high in (
+        (bodies.size * 255, 25, 75),
+        (bodies.shape, 0.1, 1.0),
+        (bodies.translation * 255, 88, 168),
+    ):
+        assert low <= values.min() < low + 0.01 * high
+        assert high - 0.01 * high < values.max() <= high
+        np.testing.assert_allclose(values.mean(axis=0), (low + high) / 2, rtol=0.03)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_thesis_bodies_obey_the_protocol(seed):
-    scene = thesis_scene(np.random.default_rng(seed))
-    cube = unit_cube.cube_from_optical(scene.bodies)
-    assert ((cube.size * 255 >= 25) & (cube.size * 255 <= 75)).all()
-    assert ((cube.shape >= 0.1) & (cube.shape <= 1)).all()
-    assert ((cube.translation * 255 >= 88 - 1e-9) & (cube.translation * 255 <= 168 + 1e-9)).all()
-    depth, labels = scene.render()
+def test_the_thesis_camera_sees_its_body_on_nothing(seed):
+    depth, labels = thesis_scene(np.random.default_rng(seed)).render()
     assert depth.shape == (256, 256)
     assert set(np.unique(labels)) == {0, 1}
     assert (np.isfinite(depth) == (labels == 1)).all()
@@ -82,3 +91,43 @@ def test_misuse_is_named():
 
 def test_where_a_view_has_no_room_for_all_bodies_another_one_is_taken():
     assert len(table_scene(np.random.default_rng([3, 1, 0]), 10).bodies) == 10
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_crowd_rests_touches_and_does_not_overlap(seed):
+    rng = np.random.default_rng(seed)
+    scene = scenes.draw_crowd(rng, 5)
+    normal, offset = scene.plane[:3], scene.plane[3]
+    surfaces = [body.sample_surface(4000, np.random.default_rng(1)) for body in scene.bodies]
+    gaps = []
+    for k, body in enumerate(scene.bodies):
+        height = surfaces[k] @ normal + offset
+        assert height.min() > -1e-9
+        assert height.min() < 2e-3
+        others = [body.gauge(surface) for j, surface in enumerate(surfaces) if j != k]
+        assert min(gauge.min() for gauge in others) > 0.97
+        gaps.append(min(gauge.min() for gauge in others))
+    assert min(gaps) < 1.05  # at least one pair touches
+
+
+def test_crowds_are_refused_where_there_is_no_room():
+    with pytest.raises(ValueError, match="1 to 12"):
+        scenes.draw_crowd(np.random.default_rng(0), 13)
+    with pytest.raises(ValueError, match="no room"):
+        scenes.draw_crowd(np.random.default_rng(0), 3, Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_crowd_seen_by_a_stereo_camera_is_parted(seed):
+    """Noise that is alike over windows of pixels makes folds and hides them; lines of sight are longer than windows."""
+    rng = np.random.default_rng(seed)
+    scene = scenes.draw_crowd(rng, 6)
+    depth, truth = scene.render()
+    found = segment(sensor_noise.preset("realsense_d435").measure(depth, scene.camera, rng), scene.camera)
+    visible = [k for k in set(np.unique(truth)) - {0} if np.sum(truth == k) > 1500]
+    assert len(visible) - 1 <= len(found.ids) <= 6
+    good = [
+        max(np.sum((found.labels == j) & (truth == k)) / np.sum((found.labels == j) | (truth == k)) for j in found.ids)
+        for k in visible
+    ]
+    assert np.mean(good) > 0.8

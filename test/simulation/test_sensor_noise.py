@@ -51,7 +51,7 @@ def test_a_plane_has_the_claimed_deviation_and_no_bias(name, z, angle, rng):
     cosine = InverseDepth.of(true, CAMERA).cosine()
     sigma = model.sigma(true, np.clip(cosine, 1e-3, 1))
     relative = np.concatenate(
-        [((model.measured(true, CAMERA, rng) - true) / sigma)[:, 60:] for _ in range(4 if angle else 8)]
+        [((model.measure(true, CAMERA, rng) - true) / sigma)[:, 60:] for _ in range(4 if angle else 8)]
     )
     seen = np.isfinite(relative)
     # A moving average over 45 to 81 pixels leaves some 10^4 independent readings in 8 images.
@@ -71,7 +71,7 @@ def test_the_cosine_of_a_plane_is_exact():
 
 @pytest.mark.parametrize("model", [KINECT, D435], ids=["kinect_v1", "realsense_d435"])
 def test_steps_are_uniform_in_disparity(model, rng):
-    measured = model.measured(wall(1.4, 30.0), CAMERA, rng)
+    measured = model.measure(wall(1.4, 30.0), CAMERA, rng)
     levels = CAMERA.fx / measured[np.isfinite(measured)].astype(float) / (CAMERA.fx * model.quantum)
     np.testing.assert_allclose(levels, np.rint(levels), atol=2e-3)
     gaps = np.diff(np.unique(np.rint(levels)))
@@ -97,7 +97,7 @@ def test_sigma_is_that_of_the_publications():
 
 def test_noise_of_triangulation_is_shared_within_the_window(rng):
     model = dataclasses.replace(D435, step=0.0)
-    error = model.measured(wall(1.0), CAMERA, rng)[:, 60:] - 1.0
+    error = model.measure(wall(1.0), CAMERA, rng)[:, 60:] - 1.0
     columns, rows = model.window
     for lag in (1, 4, columns, columns + 6):
         found = np.mean(error[:, lag:] * error[:, :-lag]) / np.mean(error**2)
@@ -112,7 +112,7 @@ def test_noise_of_triangulation_is_shared_within_the_window(rng):
 @pytest.mark.parametrize("baseline", [0.075, -0.075])
 def test_shadows_lie_on_the_side_away_from_the_projector_and_have_its_width(baseline, rng):
     model = dataclasses.replace(STILL, baseline=baseline)
-    missing = np.isnan(model.measured(two_walls(), CAMERA, rng))
+    missing = np.isnan(model.measure(two_walls(), CAMERA, rng))
     width = CAMERA.fx * 0.075 * (1 / 1.0 - 1 / 1.5)
     for row in missing[::20]:
         ((first, last),) = runs(row)
@@ -122,7 +122,7 @@ def test_shadows_lie_on_the_side_away_from_the_projector_and_have_its_width(base
 
 def test_a_thin_pole_casts_a_shadow_apart_from_itself(rng):
     depth = two_walls(1.0, 2.5, 160, 166)
-    ((first, last),) = runs(np.isnan(STILL.measured(depth, CAMERA, rng))[100])
+    ((first, last),) = runs(np.isnan(STILL.measure(depth, CAMERA, rng))[100])
     assert last - first + 1 == pytest.approx(6, abs=1)
     assert 160 - first == pytest.approx(CAMERA.fx * 0.075 * (1 / 1.0 - 1 / 2.5), abs=1)
 
@@ -134,18 +134,18 @@ def test_a_tilted_plane_hides_nothing_of_itself():
 
 def test_stereo_misses_the_columns_outside_the_second_image(rng):
     for z in (0.6, 1.0, 2.0):
-        missing = np.isnan(ZED.measured(wall(z), CAMERA, rng))
+        missing = np.isnan(ZED.measure(wall(z), CAMERA, rng))
         ((first, last),) = runs(missing[50])
         assert (first, last + 1) == (0, pytest.approx(CAMERA.fx * 0.12 / z, abs=1))
     mirrored = dataclasses.replace(ZED, baseline=-0.12)
-    ((_, last),) = runs(np.isnan(mirrored.measured(wall(1.0), CAMERA, rng))[50])
+    ((_, last),) = runs(np.isnan(mirrored.measure(wall(1.0), CAMERA, rng))[50])
     assert last == CAMERA.width - 1
-    assert not np.isnan(KINECT.measured(wall(1.0), CAMERA, rng)).any()
+    assert not np.isnan(KINECT.measure(wall(1.0), CAMERA, rng)).any()
 
 
 def test_stereo_fattens_the_foreground_over_its_shadow(rng):
     model = dataclasses.replace(D435, edge_wander=0.0, fattening=3)
-    measured = model.measured(two_walls(1.0, 2.0), CAMERA, rng)[100]
+    measured = model.measure(two_walls(1.0, 2.0), CAMERA, rng)[100]
     assert runs(measured < 1.2) == [(117, 202)]
     shadow = runs(np.isnan(measured))[-1]
     assert shadow[1] == 116
@@ -157,7 +157,7 @@ def test_edges_wander_by_the_stated_pixels(wander, rng):
     model = dataclasses.replace(KINECT, edge_wander=wander)
     near = np.zeros(16)
     for _ in range(12):
-        near += (model.measured(two_walls(), CAMERA, rng)[:, 192:208] < 1.2).mean(axis=0) / 12
+        near += (model.measure(two_walls(), CAMERA, rng)[:, 192:208] < 1.2).mean(axis=0) / 12
     # The edge lies between columns 199 and 200; column c shows the near face if it looks left of the edge.
     expected = norm.cdf((199.5 - np.arange(192, 208)) / wander)
     reached = np.abs(np.arange(192, 208) - 199.5) < 4
@@ -171,7 +171,7 @@ def test_edges_wander_without_moving_surfaces(rng):
     depth = wall(1.6, 40.0)
     depth[:, 120:200] = wall(1.0, -40.0)[:, 120:200]
     model = dataclasses.replace(KINECT, edge_wander=2.0)
-    measured = model.measured(depth, CAMERA, rng)
+    measured = model.measure(depth, CAMERA, rng)
     sigma = KINECT.sigma(1.8, np.cos(np.radians(40.0)))
     off = np.minimum(np.abs(measured - wall(1.6, 40.0)), np.abs(measured - wall(1.0, -40.0)))
     assert np.nanmax(off) < 6 * sigma
@@ -179,22 +179,22 @@ def test_edges_wander_without_moving_surfaces(rng):
 
 def test_flying_pixels_lie_between_foreground_and_background(rng):
     model = dataclasses.replace(AZURE, mixed_loss=0.0)
-    measured = np.stack([model.measured(two_walls(1.0, 1.5), CAMERA, rng) for _ in range(4)])
+    measured = np.stack([model.measure(two_walls(1.0, 1.5), CAMERA, rng) for _ in range(4)])
     between = (measured > 1.02) & (measured < 1.48)
     assert set(np.nonzero(between.any(axis=(0, 1)))[0]) == {119, 120, 199, 200}
     assert between[:, :, [119, 120, 199, 200]].mean() > 0.8
     assert measured.min() > 1.0 - 6 * model.sigma(1.0)
     assert measured.max() < 1.5 + 6 * model.sigma(1.5)
-    half = dataclasses.replace(AZURE, mixed_loss=0.5).measured(two_walls(1.0, 1.5), CAMERA, rng)
+    half = dataclasses.replace(AZURE, mixed_loss=0.5).measure(two_walls(1.0, 1.5), CAMERA, rng)
     assert np.isnan(half[:, [119, 120, 199, 200]]).mean() == pytest.approx(0.5, abs=0.06)
-    whole = dataclasses.replace(model, footprint=0.0).measured(two_walls(1.0, 1.5), CAMERA, rng)
+    whole = dataclasses.replace(model, footprint=0.0).measure(two_walls(1.0, 1.5), CAMERA, rng)
     assert not ((whole > 1.02) & (whole < 1.48)).any()
 
 
 def test_the_nearer_surface_returns_more_light(rng):
     # The light of a face goes with 1 / z^2; the near face's share of a pixel on the far one is 0 to 1/2.
     model = dataclasses.replace(AZURE, mixed_loss=0.0)
-    far = np.concatenate([model.measured(two_walls(1.0, 2.0), CAMERA, rng)[:, 200] for _ in range(30)])
+    far = np.concatenate([model.measure(two_walls(1.0, 2.0), CAMERA, rng)[:, 200] for _ in range(30)])
     share = np.linspace(0, 0.5, 1001)
     expected = (share * 1.0 + (1 - share) * 0.5) / (share * 1.0 + (1 - share) * 0.25)
     assert np.mean(far) == pytest.approx(np.mean(expected), abs=0.01)
@@ -215,7 +215,7 @@ def test_dropout_grows_with_the_angle_as_claimed(name, rng):
         # Beside the band that stereo does not see, and where the plane is in range; it faces the second eye.
         inside[:, 200:] = True
         inside &= (true < 2.5) & (true > 0.9)
-        missing = np.mean([np.isnan(model.measured(true, camera, rng)[inside]).mean() for _ in range(6)])
+        missing = np.mean([np.isnan(model.measure(true, camera, rng)[inside]).mean() for _ in range(6)])
         assert missing == pytest.approx(model.dropout(true, cosine)[inside].mean(), abs=0.06)
         lost.append(missing)
     assert lost[0] == 0
@@ -230,17 +230,17 @@ def test_dropout_grows_with_the_angle_as_claimed(name, rng):
 @pytest.mark.parametrize("name", NAMES)
 def test_nothing_stays_nothing_and_readings_keep_the_range(name, rng):
     model = PRESETS[name]
-    assert np.isnan(model.measured(np.full((240, 320), np.nan), CAMERA, rng)).all()
-    assert np.isnan(model.measured(np.full((240, 320), np.inf, np.float32), CAMERA, rng)).all()
+    assert np.isnan(model.measure(np.full((240, 320), np.nan), CAMERA, rng)).all()
+    assert np.isnan(model.measure(np.full((240, 320), np.inf, np.float32), CAMERA, rng)).all()
     hole = wall(1.0)
     hole[60:180, 120:240] = np.nan
     hole[:40, 200:] = np.inf
-    measured = model.measured(hole, CAMERA, rng)
+    measured = model.measure(hole, CAMERA, rng)
     # Up to the pixels by which edges wander or foregrounds are fattened.
     assert np.isnan(measured[68:172, 128:232]).all()
     assert np.isnan(measured[:32, 208:]).all()
     for outside in (1e-9, 0.8 * model.near, 2 * model.far):
-        assert np.isnan(model.measured(np.full((240, 320), outside), CAMERA, rng)).all()
+        assert np.isnan(model.measure(np.full((240, 320), outside), CAMERA, rng)).all()
 
 
 # All of it
@@ -251,13 +251,13 @@ def test_a_seed_names_an_image_and_the_truth_is_left_alone(name):
     model = Ideal(0.002) if name == "ideal" else preset(name)
     true, _ = table_scene(np.random.default_rng(2), 2, CAMERA).render()
     kept = true.copy()
-    first, again, other = (model.measured(true, CAMERA, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    first, again, other = (model.measure(true, CAMERA, np.random.default_rng(seed)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other, equal_nan=True)
     np.testing.assert_array_equal(true, kept)
     assert first.dtype == np.float32
     assert first.shape == true.shape
-    np.testing.assert_array_equal(model.measured(true.astype(float), CAMERA, np.random.default_rng(1)), first)
+    np.testing.assert_array_equal(model.measure(true.astype(float), CAMERA, np.random.default_rng(1)), first)
 
 
 def test_the_ideal_sensor_adds_its_deviation_and_nothing_else(rng):
@@ -265,24 +265,24 @@ def test_the_ideal_sensor_adds_its_deviation_and_nothing_else(rng):
     depth[:20] = np.nan
     depth[20:40] = np.inf
     camera = Camera(200, 200, 200.0, 200.0, 99.5, 99.5)
-    noisy = Ideal(0.01).measured(depth, camera, rng)
+    noisy = Ideal(0.01).measure(depth, camera, rng)
     assert np.isnan(noisy[:40]).all()
     assert np.std(noisy[40:]) == pytest.approx(0.01, rel=0.02)
-    np.testing.assert_array_equal(Ideal().measured(depth, camera, rng)[40:], depth[40:])
+    np.testing.assert_array_equal(Ideal().measure(depth, camera, rng)[40:], depth[40:])
     below = np.full((9, 9), -0.5)
-    np.testing.assert_array_equal(Ideal().measured(below, unit_cube.camera(9), rng), below)
+    np.testing.assert_array_equal(Ideal().measure(below, unit_cube.camera(9), rng), below)
 
 
 def test_misuse_is_named(rng):
     for model in (KINECT, AZURE, D435, Ideal(0.001)):
         with pytest.raises(ValueError, match="does not fit a camera of 320 x 240"):
-            model.measured(np.ones((4, 5)), CAMERA, rng)
+            model.measure(np.ones((4, 5)), CAMERA, rng)
         with pytest.raises(ValueError, match="expected a floating image"):
-            model.measured(np.ones((240, 320), np.uint16), CAMERA, rng)
+            model.measure(np.ones((240, 320), np.uint16), CAMERA, rng)
         with pytest.raises(ValueError, match="expected a floating image"):
-            model.measured(np.ones((240, 320, 1)), CAMERA, rng)
+            model.measure(np.ones((240, 320, 1)), CAMERA, rng)
         with pytest.raises(TypeError, match=r"numpy\.random\.Generator"):
-            model.measured(wall(1.0), CAMERA, 7)
+            model.measure(wall(1.0), CAMERA, 7)
         for z in (0.0, -1.0, np.nan):
             with pytest.raises(ValueError, match="z: expected positive"):
                 model.sigma(z)
@@ -292,9 +292,9 @@ def test_misuse_is_named(rng):
     for model in PRESETS.values():
         for bad in (0.0, -1.0, -np.inf):
             with pytest.raises(ValueError, match="expected positive metres"):
-                model.measured(np.full((240, 320), bad), CAMERA, rng)
+                model.measure(np.full((240, 320), bad), CAMERA, rng)
         with pytest.raises(ValueError, match="pinhole"):
-            model.measured(np.ones((9, 9)), unit_cube.camera(9), rng)
+            model.measure(np.ones((9, 9)), unit_cube.camera(9), rng)
     with pytest.raises(ValueError, match="expected one of kinect_v1, azure_kinect"):
         preset("lidar")
     for change in ({"baseline": 0.0}, {"focal": -1.0}, {"far": 0.2}, {"window": (4, 5)}, {"blind": 60.0}, {"step": -1}):
@@ -362,7 +362,7 @@ def test_recorded_planes_scatter_like_the_model(shared_data, file, model, low, h
     v, u = np.indices(depth.shape)
     flat = law[0] * u + law[1] * v + law[2]
     true = np.where(flat > 0.2, 1 / np.maximum(flat, 0.2), np.nan)
-    simulated = np.rint(1e3 * model.measured(true, camera, rng)) / 1e3
+    simulated = np.rint(1e3 * model.measure(true, camera, rng)) / 1e3
     real_z, real = spreads(depth, table)
     model_z, claimed = spreads(simulated, table)
     ratios = []

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.geometry.union import support_of_union
+from sq_perception.geometry.union import DIRECTIONS, support_of_union
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import things_on_table as module
 from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_table

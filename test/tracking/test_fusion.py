@@ -26,7 +26,7 @@ from tracked_bodies import (
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.tracking import forms, state
+from sq_perception.tracking import association, state
 from sq_perception.tracking.tracker import PREDICTED_SHARE, Tracker
 
 # Forms
@@ -34,7 +34,7 @@ from sq_perception.tracking.tracker import PREDICTED_SHARE, Tracker
 
 def test_the_first_eight_forms_are_the_equivalent_ones():
     truth = body()
-    flats = forms.candidates(truth.to_flat())[: forms.EXACT]
+    flats = association.candidates(truth.to_flat())[: association.EXACT]
     for other in truth.equivalent_forms():
         same = [
             np.allclose(flat[:8], other.to_flat()[:8]) and quaternions.geodesic_angle(flat[8:], other.rotation) < 1e-7
@@ -46,7 +46,7 @@ def test_the_first_eight_forms_are_the_equivalent_ones():
 def test_all_forms_are_one_body_where_the_exponents_are_equal(rng):
     truth = body(shape=(0.4, 0.4))
     points = truth.translation + rng.uniform(-0.06, 0.06, (200, 3))
-    for flat in forms.candidates(truth.to_flat()):
+    for flat in association.candidates(truth.to_flat()):
         np.testing.assert_allclose(Superquadric.from_flat(flat).gauge(points), truth.gauge(points), rtol=1e-9)
 
 
@@ -54,7 +54,7 @@ def test_the_nearest_form_undoes_any_exact_one_with_its_covariance(rng):
     truth, covariance = body(), correlated(rng)
     for form in range(8):
         seen = draw(truth, covariance, rng, form, np.zeros(11))
-        states, covariances = forms.nearest(
+        states, covariances = association.nearest_form(
             truth.to_flat()[None],
             state.scale_sizes(noise(), truth.size)[None],
             seen.superquadric.to_flat()[None],
@@ -68,18 +68,18 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
     """A box is recognised with any axis as z; a cylinder is not, as none of its other axes is one of revolution."""
     for shape, allowed in (((0.2, 0.3), True), ((0.2, 0.9), False)):
         truth = body(shape=shape)
-        flat = forms.candidates(truth.to_flat())
+        flat = association.candidates(truth.to_flat())
         flat[:, 3:5] = shape
         count = len(flat)
-        states, _ = forms.nearest(
+        states, _ = association.nearest_form(
             np.tile(truth.to_flat(), (count, 1)),
             state.scale_sizes(noise(), np.tile(truth.size, (count, 1))),
             flat,
             state.scale_sizes(noise(), flat[:, :3]),
         )
         turn = quaternions.geodesic_angle(states[:, 8:12], truth.rotation)
-        assert (turn[: forms.EXACT] < 1e-6).all()
-        assert (turn[forms.EXACT :] < 1e-6).all() == allowed
+        assert (turn[: association.EXACT] < 1e-6).all()
+        assert (turn[association.EXACT :] < 1e-6).all() == allowed
 
 
 # Honest numbers
@@ -334,7 +334,7 @@ def test_axes_never_jump(size, shape, rng):
         seen = draw(truth, noise(0.02, 0.03, 0.001, 0.05), rng)
         if shape[1] - shape[0] < 0.1:
             turn = int(rng.integers(24))
-            seen = exchanged(seen, turn) if turn >= forms.EXACT else seen
+            seen = exchanged(seen, turn) if turn >= association.EXACT else seen
         (track,) = tracker.update([seen], k / 30)
         assert track.id == 1
         if last is not None:

@@ -7,7 +7,7 @@ import pytest
 from tracked_bodies import Seen, angle_between, body, draw, exchanged, from_camera, looking_at, noise, spread_bodies
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.tracking import forms, session, state
+from sq_perception.tracking import association, session, state
 from sq_perception.tracking.session import Tally, TrackingSession
 from sq_perception.tracking.tracker import Tracker
 
@@ -157,7 +157,7 @@ def test_without_a_pose_there_are_ids_and_forms_but_no_fusion(rng):
     assert one.tally == Tally(tracks=1, births=1, resets=0, without_pose=15)
 
 
-EXCHANGES = range(forms.EXACT, len(forms.TURNS))
+EXCHANGES = range(association.EXACT, len(association.TURNS))
 
 
 @pytest.mark.parametrize("turn", EXCHANGES)
