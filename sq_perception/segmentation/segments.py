@@ -37,7 +37,6 @@ from sq_perception.segmentation import (
     convex_parts,
     level_faces,
     objectness,
-    pieces,
     support_plane,
     support_surface,
 )
@@ -215,7 +214,6 @@ def support_under(
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by a ball on a table, beside a hole, and by two that touch."""
     convex_parts.warm_up()
-    pieces.warm_up()
     camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
     v, u = np.indices((camera.height, camera.width))
     radius = np.hypot(u - camera.cx, v - camera.cy) / 20
