@@ -23,8 +23,8 @@ Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-o
 from __future__ import annotations
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import line_of_sight
@@ -168,7 +168,7 @@ def _crossed_between(
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,).
 
-    0 where two go on behind something nearer or are of one vessel; 1/2, which says nothing, where they are neither these nor near.
+    0 where two go on behind something nearer or are of one vessel; 1/2, which says nothing, where they are far apart.
     """
     pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
     together = pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
@@ -192,7 +192,34 @@ def _crossed_between(
 
 
 def linked(distance: np.ndarray, limit: float) -> np.ndarray:
-    """Groups (n,) from 0 by average linkage: the nearest two of (n, n) are joined until none are nearer than a limit."""
-    if len(distance) < 2:
-        return np.zeros(len(distance), int)
-    return fcluster(linkage(distance[np.triu_indices(len(distance), 1)], "average"), limit, "distance") - 1
+    """Groups (n,) from 0 by average linkage: the two nearest are joined until none of (n, n) are nearer than a limit.
+
+    SciPy has it too, and loads much that a node needs for nothing else.
+    """
+    return np.unique(_linked(distance, limit), return_inverse=True)[1]
+
+
+@kernel
+def _linked(distance: np.ndarray, limit: float) -> np.ndarray:
+    n = len(distance)
+    far, size, group, nearest = distance.copy(), np.ones(n), np.arange(n), np.zeros(n, np.int64)
+    for k in range(n):
+        far[k, k] = np.inf
+        nearest[k] = np.argmin(far[k])
+    while True:
+        i = 0
+        for k in range(1, n):
+            if far[k, nearest[k]] < far[i, nearest[i]]:
+                i = k
+        j = nearest[i]
+        if not far[i, j] < limit:
+            return group
+        mean = (size[i] * far[i] + size[j] * far[j]) / (size[i] + size[j])
+        mean[i] = np.inf
+        far[i], far[:, i], far[j], far[:, j] = mean, mean, np.inf, np.inf
+        size[i] += size[j]
+        for k in range(n):
+            if group[k] == j:
+                group[k] = i
+            if k == i or nearest[k] == i or nearest[k] == j or far[k, i] < far[k, nearest[k]]:
+                nearest[k] = np.argmin(far[k])

@@ -1,8 +1,8 @@
 """What one frame shows: its objects, how surely a pixel is of which, and the support with the noise about it.
 
 The segmentation makes it, and the stages behind it read it: views and fits the membership of pixels, supports the
-plane, repeated frames the noise, deviations of sizes the pairs of objects that may be one.  docs/segmentation.md
-derives both probabilities and what they are worth.
+plane, repeated frames the noise, deviations of sizes the pairs of objects that may be one, and with the score of its
+body these say whether an object is a fragment.  docs/segmentation.md derives the probabilities and what they are worth.
 
 Metres and pixels.
 """
@@ -82,6 +82,15 @@ class FrameEvidence:
     def likely(self) -> dict[int, float]:
         """The probability that each object is a thing, by its label."""
         return dict(zip(self.ids, self.objectness or (1.0,) * len(self.ids), strict=True))
+
+    def same_as_larger(self) -> dict[int, float]:
+        """The greatest probability that an object is one with another of twice its pixels at least, by its label; of
+        objects that have such another one."""
+        if self.same is None:
+            return {}
+        counts = regions.extents(self.labels)[list(self.ids), 0]
+        same = np.where(counts >= 2 * counts[:, None], self.same, 0.0).max(axis=1, initial=0.0)
+        return {label: each for label, each in zip(self.ids, same.tolist(), strict=True) if each > 0}
 
     def kept(self, likely: dict[int, float]) -> FrameEvidence:
         """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""
