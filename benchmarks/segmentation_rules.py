@@ -61,12 +61,12 @@ _S = "sq_perception.segmentation"
 _OWN = "sq_perception.recovery.own_segments"
 RULES: dict[str, dict[str, Any]] = {
     "plane: things are near above it (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
-    "support: bent": {f"{_S}.support_surface._DISTORTION": 0.0},
+    "support: bent": {f"{_S}.support_plane._DISTORTION": 0.0},
     "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
     "level tops (level_faces)": {f"{_S}.level_faces.found": lambda *_: []},
     "walls of containers (container_walls)": {f"{_S}.container_walls.walls": lambda *_: set()},
     "bodies: grazing sides (_GAP)": {f"{_S}.bodies._GAP": 0.0},
-    "bodies: feet (_FOOT_PIXELS)": {f"{_S}.bodies._FOOT_PIXELS": 0},
+    "bodies: feet and rims (_GROWN)": {f"{_S}.bodies._GROWN": 0},
     "pieces: of all": {f"{_S}.convex_parts._pieces": lambda *_: []},
     "pieces: as large near by (_NEAR)": {f"{_S}.line_of_sight._NEAR": 1e-6},
     "pieces: nearest first (_METRIC)": {f"{_S}.convex_parts._METRIC": 0.0},

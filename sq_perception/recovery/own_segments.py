@@ -1,7 +1,6 @@
 """Segments of a depth image as a network sees them: which of them are one object, and which pixels are outliers.
 
-Rules of geometry take an image apart (:mod:`sq_perception.segmentation.segments`); a network that saw thousands of such
-segments knows better what belongs together.  For a segment a it predicts p_a(x), the probability that the reading of a
+For a segment a of :mod:`sq_perception.segmentation.segments` it predicts p_a(x), the probability that the reading of a
 pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask_network`).
 
     parted    if the mean of p_a over one of four compact pieces of a is below ``_SURE``, the network is asked about
@@ -38,8 +37,8 @@ from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.segmentation import objectness
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
+from sq_perception.segmentation.options import LARGEST_THING, POINTS, largest_edge
 
 _ONE = (0.5, -0.5)
 """k and c: of a logistic regression over pairs of segments of simulated scenes."""
@@ -168,7 +167,7 @@ class SegmentNetwork:
         """Whether what a mask (height, width) shows may be one object, or one piece of furniture, which is left out
         whole: no object is between ``max_size`` and the largest thing."""
         rows, columns = np.nonzero(mask)
-        points = regions.some_points(rows, columns, self.depth, self.camera, 400)
+        points = regions.some_points(rows, columns, self.depth, self.camera, POINTS)
         edge = largest_edge(points, None if self.plane is None else self.plane[:3])
         return edge <= self.max_size or edge > LARGEST_THING
 

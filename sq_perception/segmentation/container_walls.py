@@ -19,7 +19,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.segmentation.extent import across
+from sq_perception.segmentation.options import across
 
 _TOP, _AS_HIGH = 0.95, 0.008
 """Share of a segment's points below its top, and metres by which tops of walls may differ: noise of a rim."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_surface import SupportSurface
+from sq_perception.segmentation.support_plane import SupportSurface
 
 LEAST_SIGMA, UNKNOWN_SIGMA = 5e-4, 1.5e-3
 """Noise of the depth at one metre, metres: what is assumed at least, as rendered images have none, and where no support
@@ -94,6 +94,8 @@ class FrameEvidence:
 
     def kept(self, likely: dict[int, float]) -> FrameEvidence:
         """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""
+        if tuple(likely) == self.ids == tuple(range(1, len(self.ids) + 1)):
+            return replace(self, objectness=tuple(likely.values()))
         counts = regions.extents(self.labels)[:, 0]
         order = sorted(likely, key=lambda label: (-counts[label], label))
         number = np.zeros(len(counts), np.int32)

@@ -22,16 +22,15 @@ import numpy as np
 from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.extent import TURNS, across
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
-from sq_perception.segmentation.support_surface import SupportSurface, flat
+from sq_perception.segmentation.options import POINTS, TURNS, across
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat, noise_growth
 
 _LOWEST = 5.0
 """Tolerances above the support at which a face lies at least: lower ones are books and bumps."""
 _LAYER = 0.7
 """Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
-_SAMPLES, _FEWEST = 400, 30
-"""Samples of a segment, evenly taken, and the fewest of a face of it."""
+_FEWEST = 30
+"""Points of a face, of some hundred of its segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -
     extents = regions.extents(labels)
     order = np.argsort(-extents[:, 0], kind="stable")
     order = order[(extents[order, 0] >= least) & (order > 0)]
-    return {int(label): _points(labels, int(label), extents[label], depth, camera, _SAMPLES) for label in order}
+    return {int(label): _points(labels, int(label), extents[label], depth, camera, POINTS) for label in order}
 
 
 def found(

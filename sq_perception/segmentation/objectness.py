@@ -47,7 +47,6 @@ _BLOCKS = (4, 32)
 """Pixels a side of the smallest and the largest block of the support."""
 _SUPPORT = 0.03
 """Up to this height, metres, a pixel of no segment tells of the support."""
-_FEWEST_BLOCKS = 8
 _LEAST_DEVIATION = 3e-4
 """Metres: a rendered image has none."""
 
@@ -130,6 +129,6 @@ def _deviation_of_means(relative: np.ndarray, is_support: np.ndarray, side: int)
     share = cv2.resize(known, size, interpolation=cv2.INTER_AREA)
     sums = cv2.resize(known * relative[:rows, :columns], size, interpolation=cv2.INTER_AREA)
     means = sums[share > 0.7] / share[share > 0.7]
-    if len(means) < _FEWEST_BLOCKS:
+    if len(means) < 8:
         return np.inf
     return float(np.sqrt(np.mean(np.square(means))))
