@@ -128,23 +128,23 @@ def _extents(labels: np.ndarray, count: int) -> np.ndarray:
 
 
 def borders(
-    labels: np.ndarray, depth: np.ndarray, count: int, near: float, far: float
+    labels: np.ndarray, depth: np.ndarray, count: int, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How often each two of the labels 0 to ``count`` are next to each other along the rows and the columns of an
     image, across pixels without a depth (0); the image's border is of label 0.
 
     Returns three numbers of contacts (count + 1, count + 1): of all; of those at which the two are less than ``near``
     metres apart along the line of sight, 0 for label 0; of those at which a (row) is farther than b (column) by a depth
-    step, and by less than ``far`` metres.
+    step.
     """
     labels = np.ascontiguousarray(labels, dtype=np.int32)
-    met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near, far)
+    met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near)
     return met + met.T, beside + beside.T, behind
 
 
 @kernel
 def _borders(
-    labels: np.ndarray, depth: np.ndarray, count: int, near: float, far: float
+    labels: np.ndarray, depth: np.ndarray, count: int, near: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As :func:`borders`; each contact is entered once in ``met`` and ``beside``, for one of the two orders."""
     n = count + 1
@@ -163,7 +163,7 @@ def _borders(
                         if other > 0 and here > 0:
                             apart = abs(other_z - z)
                             beside[other, here] += apart < near
-                            if depth_steps.STEP * min(other_z, z) < apart < far:
+                            if depth_steps.STEP * min(other_z, z) < apart:
                                 behind[(other, here) if other_z > z else (here, other)] += 1
                 left = above[u] = here
                 left_z = above_z[u] = z

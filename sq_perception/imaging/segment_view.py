@@ -116,6 +116,32 @@ def from_segment(
     return SegmentView(image, rows[centre], columns[centre], left, top, side, high)
 
 
+def compact_pieces(cells: np.ndarray, count: int, place: tuple[float, float]) -> np.ndarray:
+    """The piece, from 0, of each of some cells, bool (rows, columns), at most ``count`` of about one size; else -1.
+
+    The first centre is the cell farthest from a ``place``, row and column, each further one the cell farthest from
+    those before.  Every cell belongs to the nearest centre; centres move to the means of their cells (Lloyd 1982),
+    twice, then no piece is a sliver at an end.
+    """
+    at, pieces = np.argwhere(cells).astype(float), np.full(cells.shape, -1)
+    if not len(at):
+        return pieces
+    centres = at[[((at - place) ** 2).sum(axis=1).argmax()]]
+    while len(centres) < min(count, len(at)):
+        farthest = _squares(at, centres).min(axis=0).argmax()
+        centres = np.concatenate([centres, at[[farthest]]])
+    for _ in range(2):
+        of = _squares(at, centres).argmin(axis=0)
+        centres = np.stack([at[of == k].mean(axis=0) for k in np.unique(of)])
+    pieces[cells] = np.unique(_squares(at, centres).argmin(axis=0), return_inverse=True)[1]
+    return pieces
+
+
+def _squares(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Squares (m, n) of the distances of points (n, 2) from centres (m, 2)."""
+    return np.asarray((points[:, 0] - centres[:, :1]) ** 2 + (points[:, 1] - centres[:, 1:]) ** 2)
+
+
 @kernel
 def _show(
     image: np.ndarray,

@@ -1,14 +1,12 @@
 """Segments of a depth image as a network sees them: which of them are one object, and which pixels are outliers.
 
-Rules of geometry take an image apart (:mod:`sq_perception.segmentation.segments`); a network that saw thousands of such
-segments knows better what belongs together.  For a segment a it predicts p_a(x), the probability that the reading of a
+For a segment a of :mod:`sq_perception.segmentation.segments` it predicts p_a(x), the probability that the reading of a
 pixel x is of the object that most of a shows (:mod:`sq_perception.learning.networks`).
 
-    parted    if the mean of p_a over one of four compact pieces of a (:mod:`sq_perception.segmentation.pieces`) is
-              below ``_SURE``, the network is asked about that piece as if it were a segment, and then about pieces
-              that no object claims.  A piece shows another object if it claims itself, and if it and the objects
-              found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the object
-              that claims it most
+    parted    if the mean of p_a over one of four compact pieces of a is below ``_SURE``, the network is asked about
+              that piece as if it were a segment, and then about pieces that no object claims.  A piece shows another
+              object if it claims itself, and if it and the objects found so far do not claim each other: if the means
+              of p are below ``_APART``.  A pixel is of the object that claims it most
     joined    a and b are one with log odds of k (l_ab + l_ba) + c, by the mean l_ab of the logit of p_a over b; the
               surest pairs first, until none is more likely one than two.  Not where both together are larger than
               ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
@@ -37,10 +35,10 @@ from sq_perception.imaging import canonical_view, regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.segmentation import objectness, pieces
+from sq_perception.segmentation import objectness
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
+from sq_perception.segmentation.options import LARGEST_THING, POINTS, largest_edge
 
 _ONE = (0.5, -0.5)
 """k and c: of a logistic regression over pairs of segments of simulated scenes."""
@@ -49,18 +47,11 @@ _CLEAREST = 6.0
 _PIECES = 4
 """Pieces of a segment.  Each should show one thing, and enough of it to tell things apart."""
 _SURE = 0.85
-"""A segment is parted only if a piece of it claims less.  With 0.9 half as many segments again are asked about, and of
-342 simulated and recorded frames one has one more segment, of nothing; with 0.8 one of 52 recorded things is left in
-its neighbour."""
-_APART = 0.3
-"""Pieces that claim less of each other are of two objects.  Of the 884 things 0.2, 0.3 and 0.4 miss 57 each, and leave
-70, 69 and 71 bodies of none, or of parts."""
-_ITSELF = 0.5
-"""A piece that claims less of itself shows no object: what a sensor smeared, or several things."""
+"""A segment is parted only if a piece of it claims less."""
+_APART, _ITSELF = 0.3, 0.5
+"""Pieces that claim less of each other are of two objects; one that claims less of itself shows none."""
 _LEAST_TO_PART = 60
 """Cells of a segment that may be parted: 15 in a piece."""
-_POINTS = 400
-"""Points of what may be joined, for its size."""
 _LEAST_CELLS = 4
 """Cells that another segment has in a view at least, for a mean over them."""
 
@@ -176,7 +167,7 @@ class SegmentNetwork:
         """Whether what a mask (height, width) shows may be one object, or one piece of furniture, which is left out
         whole: no object is between ``max_size`` and the largest thing."""
         rows, columns = np.nonzero(mask)
-        points = regions.some_points(rows, columns, self.depth, self.camera, _POINTS)
+        points = regions.some_points(rows, columns, self.depth, self.camera, POINTS)
         edge = largest_edge(points, None if self.plane is None else self.plane[:3])
         return edge <= self.max_size or edge > LARGEST_THING
 
@@ -240,7 +231,7 @@ def _doubt(answer: _Seen) -> _Doubt | None:
     rows, columns = np.nonzero(cells)
     if len(rows) < _LEAST_TO_PART:
         return None
-    some = pieces.compact(cells, _PIECES, (rows.mean(), columns.mean()))
+    some = segment_view.compact_pieces(cells, _PIECES, (rows.mean(), columns.mean()))
     sure = _means(answer.logits, some)
     return _Doubt(answer.view, some, sure) if sure.min() < _SURE else None
 

@@ -34,8 +34,8 @@ from sq_perception.imaging import raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
 from sq_perception.segmentation import line_of_sight
-from sq_perception.segmentation.convex_pieces import linked
-from sq_perception.segmentation.sampled_image import SampledImage, stride
+from sq_perception.segmentation.convex_parts import linked
+from sq_perception.segmentation.line_of_sight import SampledImage, stride
 
 MOST_PARTS = 4
 _SAMPLES = 120
@@ -178,7 +178,7 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
     block = max(1, stride(len(rows), _SAMPLES) // 4)
     seen = set()
     for limit in _LIMITS:
-        group = linked(apart, np.ones(len(far)), limit)
+        group = linked(apart, limit)
         size = np.bincount(group)
         is_large = size >= max(4, _LEAST_SHARE * len(far))
         if not 2 <= np.count_nonzero(is_large) <= MOST_PARTS:

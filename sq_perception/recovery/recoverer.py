@@ -51,6 +51,7 @@ from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 from sq_perception.segmentation.evidence import FrameEvidence
+from sq_perception.segmentation.objectness import LEAST_OF_ITS_OWN, of_its_own
 
 __all__ = [
     "FrameRecovery",
@@ -277,12 +278,21 @@ class Recoverer:
             ]
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
         segmentation = found.segmentation
-        likely = segmentation.likely()
-        recovered = {
-            obj.label: Recovery(fit, score, obj.label, obj.pixels, likely[obj.label], parts=some, cavity=cavity)
-            for obj, fit, score, some, cavity in zip(fresh, fits, scores, made_of, cavities, strict=True)
-        }
-        bodies = tuple(known[obj.label] if obj.label in known else recovered[obj.label] for obj in found.objects)
+        likely, same = segmentation.likely(), segmentation.same_as_larger()
+        recovered = dict(known)
+        fragments = []
+        for obj, fit, score, some, cavity in zip(fresh, fits, scores, made_of, cavities, strict=True):
+            is_judged = obj.label in same and fit.status != Status.FAILED
+            own = of_its_own(same[obj.label], score) if is_judged else 1.0
+            if own < LEAST_OF_ITS_OWN:
+                fragments.append(obj.label)
+            else:
+                thing = min(own, likely[obj.label])
+                recovered[obj.label] = Recovery(fit, score, obj.label, obj.pixels, thing, parts=some, cavity=cavity)
+        bodies = tuple(recovered[obj.label] for obj in found.objects if obj.label in recovered)
+        labels = segmentation.labels
+        if fragments:
+            labels = np.where(np.isin(labels, fragments), np.int32(0), labels)
         scored = time.perf_counter()
         milliseconds = {
             "segmentation": 1e3 * (segmented - readings.began),
@@ -298,7 +308,7 @@ class Recoverer:
             doubt,
         )
         message = "; ".join(filter(None, said))
-        return FrameRecovery(bodies, milliseconds, segmentation.labels, segmentation.plane, message, doubt)
+        return FrameRecovery(bodies, milliseconds, labels, segmentation.plane, message, doubt)
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:

@@ -14,20 +14,16 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import convex_parts
 from sq_perception.segmentation.evidence import LEAST_SIGMA
-from sq_perception.segmentation.support_plane import TOLERANCE
-from sq_perception.segmentation.support_surface import CLEARLY, SupportSurface
+from sq_perception.segmentation.support_plane import CLEARLY, TOLERANCE, SupportSurface
 
-_WIDE, _MEASURED = 9, 0.99
-"""Pixels a side of the windows by whose means low things are told from noise, and the share of readings in one that
-tells of the noise."""
-_FOOT_PIXELS = 3
-"""Up to which the foot of a thing reaches below what is clearly above the support."""
+_WIDE = 9
+"""Pixels a side of the windows by whose means low things are told from noise."""
 _LEAST_AREA = 1e-4
 """Least area of a component without a step in it, square metres across the line of sight."""
-_MOST = 100
-"""Components; bounds the time of frames that are noise alone."""
+MOST = 128
+"""Components, and segments, that are looked at: bounds the time of frames that are noise alone."""
 _GROWN = 3
-"""Pixels that components grow by: those beside a step, and where they are narrow."""
+"""Pixels that components grow by: those beside a step, where they are narrow, and down to the foot of a thing."""
 _GAP = 0.1
 """Share of the depth by which pixels of a surface with steps in it differ at most: what lies behind a fringe is
 farther."""
@@ -51,7 +47,7 @@ def above(
     left, top, width, height = regions.box(clear)
     if width == 0:
         return labels
-    reach = _FOOT_PIXELS + 1
+    reach = _GROWN + 1
     top, left = max(top - reach, 0), max(left - reach, 0)
     window = slice(top, top + height + 2 * reach), slice(left, left + width + 2 * reach)
     # Contiguous, as kernels are compiled for arrays of a kind.
@@ -59,7 +55,7 @@ def above(
     camera = camera.cropped(left, top, known.shape[1], known.shape[0])
     inside = taken_apart(known, clear, camera, support.sigma)
     foot = raised[window] & (inside == 0)
-    labels[window] = depth_steps.grow(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
+    labels[window] = depth_steps.grow(inside, foot, known, _GROWN, depth_steps.STEP)
     return labels
 
 
@@ -74,7 +70,7 @@ def _low(relative: np.ndarray, valid: np.ndarray, clear_height: float) -> tuple[
     wide = cv2.blur(np.minimum(relative, clear_height), (_WIDE, _WIDE))
     share = cv2.blur(valid.astype(np.float32), (_WIDE, _WIDE))
     apart = slice(_WIDE // 2, None, _WIDE)
-    means = np.abs(wide[apart, apart])[share[apart, apart] > _MEASURED]
+    means = np.abs(wide[apart, apart])[share[apart, apart] > 0.99]
     means = means[means < clear_height]
     if not means.size:
         return np.zeros(valid.shape, bool), np.zeros(valid.shape, bool)
@@ -112,5 +108,5 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
 def _large(labels: np.ndarray, least: float) -> np.ndarray:
     """The labels with at least so many pixels, or the largest of them if there are very many, renumbered from 1."""
     counts = regions.extents(labels)[:, 0]
-    kept = counts >= max(least, np.sort(counts)[-_MOST:][0])
+    kept = counts >= max(least, np.sort(counts)[-MOST:][0])
     return regions.renumber(labels, (kept * np.cumsum(kept)).astype(np.int32))

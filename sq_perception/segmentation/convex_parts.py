@@ -1,20 +1,14 @@
-"""Convex bodies among the segments of a depth image, found by lines of sight within them.
+"""Convex bodies among the segments of a depth image, found by lines of sight within and between them.
 
-Equation
---------
-Two points of a convex body are joined by a straight line inside it.  In a pinhole image that line is straight again,
-and the inverse depth w = 1/z is linear along it:
+Within a body next to no pair of samples is crossed (:mod:`sq_perception.segmentation.line_of_sight`); among bodies that
+touch, half of the pairs or more.  That holds over the whole width of the bodies: noise that bends the surface where
+they touch is outvoted.
 
-    w(t) = (1 - t) w_i + t w_j    at the pixel    (1 - t) (u, v)_i + t (u, v)_j,    0 < t < 1.
-
-Where a pixel on the way measured something farther than the line, by more than the noise, the line crosses empty space,
-and the two points belong to two bodies, or to one that is not convex.  Something nearer hides the line and says
-nothing.  Within a body next to no pair of samples is crossed; among bodies that touch, half of the pairs or more.
-That holds over the whole width of the bodies: noise that bends the surface where they touch is outvoted.
-
-Steps
------
-1. A segment is taken apart into the convex pieces that it has (:mod:`sq_perception.segmentation.convex_pieces`).
+1. A segment of whose pairs of samples many are crossed is taken apart: its samples are clustered by average linkage,
+   the distance being the share of crossed pairs (and a little of the metric one, which orders those that nothing
+   parts).  The pieces need not be convex themselves: a third body among them, a handle and smeared edges cross their
+   lines as well.  A vessel, whose inner wall lies behind its own lines, stays whole.  Pixels go to the piece of the
+   nearest sample; where near ones disagree, to the piece to which most lines are free.
 2. Neighbouring segments between which few pairs are crossed are one body; if one is a bit, up to nearly half of them.
 3. So are the inside of a vessel and its wall, of which the inside is a step behind the near rim: a hollow segment and
    one before it, if a large share of the border of both is such a step.
@@ -30,36 +24,36 @@ from __future__ import annotations
 
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_pieces, line_of_sight
-from sq_perception.segmentation.convex_pieces import AS_ONE
-from sq_perception.segmentation.sampled_image import FEW, SampledImage, Samples, least_area
+from sq_perception.segmentation import line_of_sight
+from sq_perception.segmentation.line_of_sight import LEAST_SAMPLES, SampledImage, Samples, least_area, stride
 
+_FEW, _MANY = 30, 160
+"""Samples of a segment: to see whether its lines are crossed, 435 pairs, and to take it apart."""
+_SUSPICIOUS = 0.12
+"""Share of crossed pairs from which on a segment may be several bodies."""
+_APART = 0.55
+"""Share of crossed pairs, on average, between pieces of a segment: more than half, as between bodies that touch."""
+_METRIC = 0.3
+"""What the metric distance adds to that between samples, at most."""
+_INSIDE = 0.15
+"""Share of a segment's samples that are insides, beyond which the segment is one vessel."""
+_LEAST_SHARE = 0.5
+"""A piece shows that share of what a body that is attached to another shows at least."""
+_AS_ONE, _BIT_AS_ONE = 0.3, 0.45
+"""Share of crossed pairs below which two segments are one body; and if one is a bit, too small to be a body beside the
+other: handles and what noise broke off."""
 _NEAR = 0.03
-"""Neighbouring segments are no farther apart, metres: along the line of sight where they meet in the image, or beyond
-the distance of their samples."""
+"""Neighbouring segments are no farther apart, metres."""
 _RIM = 0.12
 """Share of an inside's border that lies behind another segment, and of the border of that."""
-_OF_RIM = 0.1
-"""Share of that border at which a piece of the other segment is a part of the wall: noise may take a wall apart, and
-other things touch it."""
-_BIT_AS_ONE = 0.45
-"""Share of crossed pairs below which a bit, too small to be a body beside one, is one body with what it is beside:
-handles and what noise broke off."""
-_HOLLOW_DEPTH = 0.3
-"""A step down into a hollow is not deeper, metres; no vessel on a table is."""
 _ALONG = 0.15
-"""Share of lines that go along both surfaces, of two segments that are one behind a nearer one: two of a box show two
-faces each, of which a fourth or more of the lines stay in one."""
+"""Share of lines that go along both surfaces, of two segments that are one behind a nearer one."""
 
 
-def corrected(
-    labels: np.ndarray,
-    depth: np.ndarray,
-    camera: Camera,
-    sigma: float,
-) -> np.ndarray:
+def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
     """Segments taken apart where they are several convex bodies, and joined where they are one.
 
     Parameters
@@ -81,13 +75,15 @@ def corrected(
     # The one layout that kernels are compiled for; labels are written to.
     image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C"), camera, sigma)
     rims = _rims(image)
-    parts, origin = _parted(image)
-    insides = _insides(image, rims, parts, origin)
-    number_of = np.arange(len(origin), dtype=np.int32)
+    origin = _part(image)
+    extents = regions.extents(image.labels)
+    sampled = [image.sampled(k, extents[k], _FEW) for k in np.flatnonzero(extents[:, 0]).tolist()]
+    parts = [part for part in sampled if part is not None]
+    number_of = np.arange(len(extents), dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
-        crossed = _crossed_between(image, parts, np.array(origin), insides)
-        group = convex_pieces.linked(crossed, np.array([len(part.z) for part in parts], float), AS_ONE)
+        crossed = _crossed_between(image, parts, names, origin, rims)
+        group = linked(crossed, _AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
     return regions.renumber(image.labels, number_of)
@@ -105,96 +101,125 @@ def warm_up() -> None:
 def _rims(image: SampledImage) -> np.ndarray:
     """Pairs (n, 2) of labels of which the first lies a depth step behind the second along a large share of the borders
     of both."""
-    met, _, behind = regions.borders(image.labels, image.depth, int(image.labels.max()), _NEAR, _HOLLOW_DEPTH)
+    met, _, behind = regions.borders(image.labels, image.depth, int(image.labels.max()), _NEAR)
     border = met.sum(axis=1)
     return np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :]))
 
 
-def _insides(image: SampledImage, rims: np.ndarray, parts: list[Samples], origin: list[int]) -> list[tuple[int, int]]:
-    """The pairs of :func:`_rims`, an inside and its wall, that are of a vessel.
-
-    The inside of a vessel is a segment that was not parted and whose surface lies behind its own lines.
-    """
-    whole = [part for part in parts if part.label in rims[:, 0] and origin.count(part.label) == 1]
-    hollow = [part.label for part in whole if _is_hollow(image, part)]
-    return [(inside, wall) for inside, wall in rims.tolist() if inside in hollow]
-
-
-def _is_hollow(image: SampledImage, part: Samples) -> bool:
-    """Whether the surface lies behind its own lines, as that of a vessel does."""
-    gap = line_of_sight.gaps(part.pixels, part.points, image.depth, image.labels).mean()
-    return bool(gap > convex_pieces.HOLLOW * image.sigma * part.distance**2)
-
-
-def _parted(image: SampledImage) -> tuple[list[Samples], list[int]]:
-    """Give the parts of segments that are several convex bodies labels of their own, in the image.
-
-    Returns samples of all segments and parts that are large enough to have some, and, for each label, the label of the
-    segment that it was a part of.
-    """
+def _part(image: SampledImage) -> np.ndarray:
+    """Give the parts of segments that are several convex bodies labels of their own, in the image; for each label the
+    one of the segment that it was a part of."""
     extents = regions.extents(image.labels)
     origin = list(range(len(extents)))
-    order = np.argsort(-extents[:, 0], kind="stable")
-    parts = []
-    for label in order[extents[order, 0] > 0].tolist():
-        part = image.sampled(label, extents[label], FEW)
-        if part is None:
-            continue
-        pieces = convex_pieces.pieces(image, part, extents[label])
-        if not pieces:
-            parts.append(part)
-        for k, (rows, columns) in enumerate(pieces):
-            name = len(origin) if k > 0 else label
-            if k > 0:
-                origin.append(label)
-            image.labels[rows, columns] = name
-            sides = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
-            sampled = image.sampled(name, np.array([len(rows), *sides]), FEW)
-            parts += [] if sampled is None else [sampled]
-    return parts, origin
+    for label in np.flatnonzero(extents[:, 0]).tolist():
+        for rows, columns in _pieces(image, label, extents[label])[1:]:
+            image.labels[rows, columns] = len(origin)
+            origin.append(label)
+    return np.array(origin)
+
+
+def _pieces(image: SampledImage, label: int, extent: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rows and columns of each convex piece of a segment; nothing where it has no such pieces.
+
+    ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
+    """
+    part = image.sampled(label, extent, _FEW)
+    if part is None or part.area < 2 * _LEAST_SHARE * least_area(part.distance):
+        return []
+    crossed, _ = line_of_sight.within(part.pixels, part.points, image.depth, *image.limits)
+    if crossed.mean() < _SUSPICIOUS:
+        return []
+    whole = image.sampled(label, extent, _MANY)
+    assert whole is not None  # no fewer than a few
+    crossed, far = line_of_sight.within(whole.pixels, whole.points, image.depth, *image.limits)
+    group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), _APART)
+    least = _LEAST_SHARE * least_area(part.distance) / whole.spacing**2
+    large = np.bincount(group) >= max(LEAST_SAMPLES, least)
+    if np.count_nonzero(large) < 2:
+        return []
+    # What is too small for a piece joins the one that it is nearest to.
+    keep = np.flatnonzero(large[group])
+    group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
+    group = _with_whole_vessels(group, image.is_inside(whole, group), far)
+    count = int(group.max()) + 1
+    if count < 2:
+        return []
+    rows, columns = regions.pixels(image.labels, label, extent)
+    block = max(1, stride(len(rows), _MANY) // 4)
+    seen = image.depth, image.focal, whole.spacing, block, *image.limits
+    chosen = line_of_sight.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
+    return [(rows[chosen == k], columns[chosen == k]) for k in range(count) if (chosen == k).any()]
+
+
+def _with_whole_vessels(group: np.ndarray, is_inside: np.ndarray, far: np.ndarray) -> np.ndarray:
+    """Groups (n,) of samples, from 0, with each inside joined to the nearest other one, by ``far`` (n, n), which is its
+    wall; one group where the segment is a vessel."""
+    inside = is_inside[group]
+    if np.count_nonzero(inside) > _INSIDE * len(group):
+        return np.zeros_like(group)
+    name = np.arange(len(is_inside))
+    for k in np.flatnonzero(is_inside):
+        name[k] = group[~inside][far[np.ix_(group == k, ~inside)].min(axis=0).argmin()]
+    return np.unique(name[group], return_inverse=True)[1]
 
 
 def _crossed_between(
-    image: SampledImage,
-    parts: list[Samples],
-    origin: np.ndarray,
-    insides: list[tuple[int, int]],
+    image: SampledImage, parts: list[Samples], names: np.ndarray, origin: np.ndarray, rims: np.ndarray
 ) -> np.ndarray:
-    """Share (n, n) of crossed lines between each two segments.
+    """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,).
 
-    0 where two go on behind something nearer or are of one vessel; inf where they are neither these nor near each
-    other.
+    0 where two go on behind something nearer or are of one vessel; 1/2, which says nothing, where they are far apart.
     """
-    names = np.array([part.label for part in parts])
-    together = pixels, points, ends = _together(parts)
-    borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)
+    pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
+    together = pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
+    borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR)
     beside, behind = (each[np.ix_(names, names)] for each in borders[1:])
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
-    crossed = line_of_sight.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
-    extents = regions.extents(image.labels)
-    is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
-    crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
+    crossed = line_of_sight.between(*together, reach, beside > 0, image.depth, *image.limits)
+    is_bit = np.array([part.area < least_area(part.distance) for part in parts])
+    crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= _AS_ONE / _BIT_AS_ONE
     far = np.isinf(crossed) & ~(is_bit[:, None] & is_bit)
-    crossed[_go_on(image, names, together, far)] = 0.0
-    for inside, wall in insides:
-        before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
-        vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
-        crossed[np.ix_(vessel, vessel)] = 0.0
-    return crossed
+    along, over = line_of_sight.hidden(*together, names, far, image.depth, image.labels, *image.limits)
+    crossed[far & (along > _ALONG) & (over < _AS_ONE)] = 0.0
+    for inside, wall in rims.tolist():
+        vessel = np.flatnonzero(names == inside)
+        is_whole = len(vessel) == 1 and np.count_nonzero(origin == inside) == 1
+        if is_whole and image.is_inside(part := parts[vessel[0]], np.zeros(len(part.z), int))[0]:
+            before = behind[vessel[0]] * (origin[names] == wall)
+            vessel = np.append(vessel, np.flatnonzero(before > _RIM * before.sum()))
+            crossed[np.ix_(vessel, vessel)] = 0.0
+    return np.where(np.isinf(crossed), 0.5, crossed)
 
 
-def _go_on(
-    image: SampledImage, names: np.ndarray, together: tuple[np.ndarray, np.ndarray, np.ndarray], wanted: np.ndarray
-) -> np.ndarray:
-    """Which of ``wanted`` pairs of segments, bool (n, n), are one surface that goes on behind something nearer.
+def linked(distance: np.ndarray, limit: float) -> np.ndarray:
+    """Groups (n,) from 0 by average linkage: the two nearest are joined until none of (n, n) are nearer than a limit.
 
-    ``names`` are the labels (n,) of the segments, ``together`` their samples as by :func:`_together`.
+    SciPy has it too, and loads much that a node needs for nothing else.
     """
-    along, over = line_of_sight.hidden(*together, names, wanted, image.depth, image.labels, *image.limits)
-    return np.asarray(wanted & (along > _ALONG) & (over < AS_ONE))
+    return np.unique(_linked(distance, limit), return_inverse=True)[1]
 
 
-def _together(parts: list[Samples]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pixels and points of the samples of all segments, and where those of each end."""
-    pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
-    return pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
+@kernel
+def _linked(distance: np.ndarray, limit: float) -> np.ndarray:
+    n = len(distance)
+    far, size, group, nearest = distance.copy(), np.ones(n), np.arange(n), np.zeros(n, np.int64)
+    for k in range(n):
+        far[k, k] = np.inf
+        nearest[k] = np.argmin(far[k])
+    while True:
+        i = 0
+        for k in range(1, n):
+            if far[k, nearest[k]] < far[i, nearest[i]]:
+                i = k
+        j = nearest[i]
+        if not far[i, j] < limit:
+            return group
+        mean = (size[i] * far[i] + size[j] * far[j]) / (size[i] + size[j])
+        mean[i] = np.inf
+        far[i], far[:, i], far[j], far[:, j] = mean, mean, np.inf, np.inf
+        size[i] += size[j]
+        for k in range(n):
+            if group[k] == j:
+                group[k] = i
+            if k == i or nearest[k] == i or nearest[k] == j or far[k, i] < far[k, nearest[k]]:
+                nearest[k] = np.argmin(far[k])

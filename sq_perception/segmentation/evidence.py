@@ -1,8 +1,8 @@
 """What one frame shows: its objects, how surely a pixel is of which, and the support with the noise about it.
 
 The segmentation makes it, and the stages behind it read it: views and fits the membership of pixels, supports the
-plane, repeated frames the noise, deviations of sizes the pairs of objects that may be one.  docs/segmentation.md
-derives both probabilities and what they are worth.
+plane, repeated frames the noise, deviations of sizes the pairs of objects that may be one, and with the score of its
+body these say whether an object is a fragment.  docs/segmentation.md derives the probabilities and what they are worth.
 
 Metres and pixels.
 """
@@ -15,7 +15,7 @@ import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_surface import SupportSurface
+from sq_perception.segmentation.support_plane import SupportSurface
 
 LEAST_SIGMA, UNKNOWN_SIGMA = 5e-4, 1.5e-3
 """Noise of the depth at one metre, metres: what is assumed at least, as rendered images have none, and where no support
@@ -83,8 +83,19 @@ class FrameEvidence:
         """The probability that each object is a thing, by its label."""
         return dict(zip(self.ids, self.objectness or (1.0,) * len(self.ids), strict=True))
 
+    def same_as_larger(self) -> dict[int, float]:
+        """The greatest probability that an object is one with another of twice its pixels at least, by its label; of
+        objects that have such another one."""
+        if self.same is None:
+            return {}
+        counts = regions.extents(self.labels)[list(self.ids), 0]
+        same = np.where(counts >= 2 * counts[:, None], self.same, 0.0).max(axis=1, initial=0.0)
+        return {label: each for label, each in zip(self.ids, same.tolist(), strict=True) if each > 0}
+
     def kept(self, likely: dict[int, float]) -> FrameEvidence:
         """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""
+        if tuple(likely) == self.ids == tuple(range(1, len(self.ids) + 1)):
+            return replace(self, objectness=tuple(likely.values()))
         counts = regions.extents(self.labels)[:, 0]
         order = sorted(likely, key=lambda label: (-counts[label], label))
         number = np.zeros(len(counts), np.int32)

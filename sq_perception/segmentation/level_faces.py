@@ -6,8 +6,8 @@ one stands alone.  Of the heights of a segment above the support
 
     a face is where most of them lie within a tolerance of one height,
 
-clearly higher than the support; it is a plane with the normal of the support, and more points lie on it
-than above it: the bottom of a vessel lies low, and its wall is most of what is seen of it.
+clearly higher than the support, and more points lie on it than above it: the bottom of a vessel lies low, and its wall
+is most of what is seen of it.
 
 Metres, optical frame.
 """
@@ -22,21 +22,15 @@ import numpy as np
 from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import support_plane
-from sq_perception.segmentation.extent import TURNS, across
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
-from sq_perception.segmentation.support_surface import SupportSurface
+from sq_perception.segmentation.options import POINTS, TURNS, across
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat, noise_growth
 
 _LOWEST = 5.0
 """Tolerances above the support at which a face lies at least: lower ones are books and bumps."""
-_LEVEL = 0.99
-"""Cosine between the normals of the support and of a face at least."""
 _LAYER = 0.7
 """Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
-_SAMPLES, _FEWEST = 400, 30
-"""Samples of a segment, evenly taken, and the fewest of a face of it: of an upright side 11 cm high 29 lie within a
-tolerance of one height.  With twice as many of both, 30 instead of 32 of 289 simulated things on cartons and stools are
-missed."""
+_FEWEST = 30
+"""Points of a face, of some hundred of its segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +59,7 @@ def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -
     extents = regions.extents(labels)
     order = np.argsort(-extents[:, 0], kind="stable")
     order = order[(extents[order, 0] >= least) & (order > 0)]
-    return {int(label): _points(labels, int(label), extents[label], depth, camera, _SAMPLES) for label in order}
+    return {int(label): _points(labels, int(label), extents[label], depth, camera, POINTS) for label in order}
 
 
 def found(
@@ -113,30 +107,19 @@ def _points(
 
 def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     """The level face that most points (n, 3) of a segment lie on; None where more of them are above it."""
-    if len(points) < _FEWEST:
-        return None
     growth = noise_growth(points[:, 2])
     height = support.plane.height(points)
     reach = TOLERANCE * quantile(growth, 0.5)
-    ordered = np.sort(height)
-    if ordered[-_FEWEST] < _LOWEST * reach:
-        return None
-    ordered = ordered[ordered >= _LOWEST * reach]
+    ordered = np.sort(height[height >= _LOWEST * reach])
     level = ordered[densest(ordered, reach)]
     if len(level) < _FEWEST:
         return None
-    on = (height >= level[0]) & (height <= level[0] + reach)
-    for _ in range(2):
-        plane = support_plane.least_squares_plane(np.ascontiguousarray(points[on].T), growth[on] ** -2.0)
-        off = (points @ plane[:3] + plane[3]) / growth
-        on = np.abs(off) < TOLERANCE
-        count = np.count_nonzero(on)
-        if count < max(_FEWEST, _LAYER * np.count_nonzero(np.abs(off) < 2 * TOLERANCE)):
-            return None
-        if plane[:3] @ support.plane.equation[:3] < _LEVEL:
-            return None
-    sigma = max(support.sigma, deviation(np.abs(off[on])))
-    face = Plane(plane, np.count_nonzero(on) / len(points), sigma)
-    if np.count_nonzero(off > TOLERANCE) > count:
+    at = float(np.median(level))
+    off = (height - at) / growth
+    on = np.abs(off) < TOLERANCE
+    count = np.count_nonzero(on)
+    within, above = (int(np.count_nonzero(some)) for some in (np.abs(off) < 2 * TOLERANCE, off > TOLERANCE))
+    if count < max(_FEWEST, _LAYER * within, above):
         return None
-    return SupportSurface(face, np.zeros_like(support.bend), 0.0, sigma)
+    sigma = max(support.sigma, deviation(np.abs(off[on])))
+    return flat(Plane(support.plane.equation - np.array([0, 0, 0, at]), count / len(points), sigma))

@@ -2,8 +2,8 @@
 
 Steps
 -----
-1. The support plane (:mod:`sq_perception.segmentation.support_plane`), bent as the sensor bends it
-   (:mod:`sq_perception.segmentation.support_surface`), and what is clearly above it.
+1. The support plane, bent as the sensor bends it (:mod:`sq_perception.segmentation.support_plane`), and what is clearly
+   above it.
 2. Components of it that no depth step cuts, taken apart where lines of sight within them cross empty space, and joined
    where none between them does (:mod:`sq_perception.segmentation.bodies`).
 3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
@@ -31,32 +31,17 @@ import numpy as np
 
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import (
-    bodies,
-    container_walls,
-    convex_parts,
-    level_faces,
-    objectness,
-    pieces,
-    support_plane,
-    support_surface,
-)
+from sq_perception.segmentation import bodies, container_walls, convex_parts, level_faces, objectness, support_plane
 from sq_perception.segmentation.evidence import UNKNOWN_SIGMA, FrameEvidence
-from sq_perception.segmentation.extent import LARGEST_THING, largest_edge
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
+from sq_perception.segmentation.options import EVERYTHING, LARGEST_THING, POINTS, SegmentationOptions, largest_edge
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
-"""What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits
-of noise."""
-_MOST = 128
-"""Segments that are looked at, the largest ones: bounds the time of frames that are noise alone."""
+"""What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m."""
 _SIDE_MEASURED = 0.6
 """Share of a side of the readings' box from which on they go on beyond it: a silhouette touches it here and there."""
 _LEAST_PIECE = 0.02
 """Share of a silhouette no larger than a thing that one of several things in it has at least."""
-_POINTS = 400
-"""Points of a segment for its size and its middle."""
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> FrameEvidence:
@@ -98,7 +83,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     plane = support_plane.support(planes, depth, valid, camera)
     if plane is None:
         return _without_support(known, valid, camera, least)
-    support = support_surface.measured(plane, known, valid, camera)
+    support = support_plane.measured(plane, known, valid, camera)
     relative = support.image_relative(known, camera)
     labels = bodies.above(known, camera, relative, valid, support)
     tops = level_faces.samples(labels, known, camera, least)
@@ -130,7 +115,7 @@ def limited(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: Se
     for label in found.ids:
         rows, columns = regions.pixels(found.labels, label, extents[label])
         seen = valid[rows, columns]
-        points = regions.some_points(rows[seen], columns[seen], depth, camera, _POINTS)
+        points = regions.some_points(rows[seen], columns[seen], depth, camera, POINTS)
         if camera.is_pinhole and not options.is_small(points, up):
             larger.add(label)
         elif not options.is_within(points):
@@ -151,14 +136,9 @@ def from_labels(
     Parameters
     ----------
     labels : integer (height, width)
-        0 (and anything negative) is background; other values are kept as they are.
+        0 (and anything negative) is background; other values are kept as they are, without those that have no depth.
     depth, camera
         As in :func:`segment`.
-
-    Returns
-    -------
-    FrameEvidence
-        Labels without a valid depth pixel are left out.
 
     Raises
     ------
@@ -188,7 +168,7 @@ def from_labels(
     is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
     around = support_plane.around(labels, ids, depth, valid, camera) if ids and camera.is_pinhole else None
-    return FrameEvidence(labels, ids, None if around is None else support_surface.flat(around), is_cut=is_cut)
+    return FrameEvidence(labels, ids, None if around is None else support_plane.flat(around), is_cut=is_cut)
 
 
 def least_pixels(size: int) -> int:
@@ -215,7 +195,6 @@ def support_under(
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by a ball on a table, beside a hole, and by two that touch."""
     convex_parts.warm_up()
-    pieces.warm_up()
     camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
     v, u = np.indices((camera.height, camera.width))
     radius = np.hypot(u - camera.cx, v - camera.cy) / 20
@@ -236,7 +215,7 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
 
 def _size(valid: np.ndarray, depth: np.ndarray, camera: Camera) -> float:
     rows, columns = np.nonzero(valid)
-    return largest_edge(regions.some_points(rows, columns, depth, camera, _POINTS))
+    return largest_edge(regions.some_points(rows, columns, depth, camera, POINTS))
 
 
 def _is_silhouette(valid: np.ndarray) -> bool:
@@ -273,4 +252,5 @@ def _ordered(found: FrameEvidence, least: int) -> FrameEvidence:
     counts = regions.extents(found.labels)[:, 0]
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
-    return replace(found, is_cut=len(order) > _MOST).kept(dict.fromkeys(order[:_MOST].tolist(), 1.0))
+    most = bodies.MOST
+    return replace(found, is_cut=len(order) > most).kept(dict.fromkeys(order[:most].tolist(), 1.0))

@@ -1,19 +1,23 @@
-"""The plane that things stand on: planes of a depth image, and which of them is the table.
+"""The plane that things stand on, as the sensor bends it: planes of a depth image, and which of them is the table.
 
 Equation
 --------
 n.p + d = 0 with |n| = 1 in the optical frame and n towards the camera, so that the height of a point above it is
 
-    h(p) = n.p + d  =  z (n_x (u - cx)/fx + n_y (v - cy)/fy + n_z) + d        for a pinhole camera,
+    h(p) = n.p + d  =  z (n_x (u - cx)/fx + n_y (v - cy)/fy + n_z) + d        for a pinhole camera.
 
-one multiplication per pixel.  Depth noise of triangulating and time-of-flight cameras grows about as z^2; tolerances
-are therefore sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.
+Depth noise of triangulating and time-of-flight cameras grows about as g(z) = z^2; tolerances are therefore
+sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.  Planes are found by RANSAC on a seeded subsample and
+least squares on the inliers.  The table is the one with many points that lies low in the image, right below what is on
+no plane.  Its calibration may bend a sensor's depth: a table is where
 
-Planes are found by RANSAC on a seeded subsample and least squares on the inliers: n draws of three miss a plane with a
-share s of the points with the probability (1 - s^3)^n.  The table is the one with many points that lies low in the
-image, right below what is on no plane.
+    | h / g - b(x, y) | < tolerance,    b = b_0 + b_1 x + b_2 y + b_3 x^2 + b_4 x y + b_5 y^2,
 
-Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981).
+x = (u - cx)/fx and y = (v - cy)/fy.  b is fitted to a band about itself again and again, so that it grows from the part
+of a table that lies in one plane over all of it, within what a calibration may be off, a share of the depth.
+
+Metres and pixels.  References: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981); P. J. Besl,
+R. C. Jain, Segmentation through variable-order surface fitting, IEEE PAMI 10 (1988).
 """
 
 from __future__ import annotations
@@ -24,7 +28,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
+from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 
@@ -32,24 +36,24 @@ TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
 _LEAST_SHARE = 0.05
 """Share of the valid pixels that a plane has at least."""
-_SEED = 0
-"""Seed of the random samples; the same image gives the same planes."""
 _PLANE_POINTS, _REFINE_POINTS = 1500, 8000
-"""On so many points planes are counted, and the best one is fitted: a share of a tenth is then known to 8 % of itself,
-and a height to a hundredth of the noise."""
+"""On so many points planes are counted, and the best one is fitted."""
 _HYPOTHESES, _FEW_POINTS = 1000, 300
-"""So many draws are counted on a few points: of 15 % of the points one plane in thirty is missed, of 10 % one in
-three."""
-_PLANES = 3
-"""A table, the floor below it and a wall behind it."""
-_APART = 2
-"""Pixels next to a body that are none of its surroundings, as they may show either."""
+"""So many draws are counted on a few points."""
 _TYPICAL_HEIGHT, _FAR = 0.1, 0.1
 """Metres above their support of what is on no plane: exp(-h / this) is near.  The mean of that at least: where all is
 far from all planes, it says nothing."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
+_SAMPLES = 120
+"""Samples along the shorter side of the image that the surface is fitted to."""
+_TERMS = 6
+"""Coefficients of a quadratic surface."""
+CLEARLY = 4.0
+"""Standard deviations of the noise from which on a height is none of it."""
+_DISTORTION = 0.02
+"""Makers of depth cameras promise an error of at most 2 % of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,10 +87,10 @@ def noise_growth(z: np.ndarray) -> np.ndarray:
 def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
     """Up to three planes, the one with most points first; each is taken away before the next is searched."""
     points = _some_points(depth, valid, camera, _REFINE_POINTS)
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(0)
     total = len(points)
     found: list[Plane] = []
-    for _ in range(_PLANES):
+    for _ in range(3):  # a table, the floor below it and a wall behind it
         if len(points) < max(12, _LEAST_SHARE * total):
             break
         plane, inside = _dominant_plane(points, rng)
@@ -147,12 +151,8 @@ def around(
         near[max(top - margin, 0) : top + height + margin, max(left - margin, 0) : left + width + margin] = True
         rows, columns = np.nonzero(mask[top : top + height, left : left + width])
         bodies.append(regions.some_points(top + rows, left + columns, depth, camera, 500))
-    left, top, width, height = regions.box(near)
-    left, top = max(left - _APART, 0), max(top - _APART, 0)
-    window = slice(top, top + height + 2 * _APART), slice(left, left + width + 2 * _APART)
-    labelled = cv2.dilate((labels[window] > 0).view(np.uint8), np.ones((2 * _APART + 1, 2 * _APART + 1), np.uint8)) > 0
-    depth, near = depth[window], near[window] & valid[window] & ~labelled
-    camera = camera.cropped(left, top, depth.shape[1], depth.shape[0])
+    # Pixels next to a body are none of its surroundings, as they may show either.
+    near &= valid & (cv2.dilate((labels > 0).view(np.uint8), np.ones((5, 5), np.uint8)) == 0)
     if np.count_nonzero(near) < 30:
         return None
     if known is not None:
@@ -247,3 +247,127 @@ def _nearness(candidates: list[Plane], points: np.ndarray) -> np.ndarray:
 def _vote(plane: Plane) -> float:
     up = -plane.equation[1]
     return plane.share * (0.25 + max(0.0, up))
+
+
+@dataclass(frozen=True, eq=False)
+class SupportSurface:
+    """A plane, and how the sensor bends it.
+
+    Attributes
+    ----------
+    plane
+        The support plane, with the noise about it.
+    bend : (6,)
+        Coefficients of the height at one metre, by 1, x, y, x^2, x y and y^2.
+    limit
+        The most that the surface bends, metres at one metre.
+    sigma
+        Standard deviation of the heights above the bent surface at a depth of one metre, metres.
+    """
+
+    plane: Plane
+    bend: np.ndarray
+    limit: float
+    sigma: float
+
+    @property
+    def clear_height(self) -> float:
+        """Height from which on something is clearly above the surface, metres at one metre of depth.
+
+        Half of the tolerance is a compromise: bent depth of real cameras stays below, thin objects stay above.
+        """
+        return max(0.5 * TOLERANCE, CLEARLY * self.sigma)
+
+    def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """Height, float32 (height, width), above the bent surface as at one metre of depth, 0 for depth 0; of a pinhole
+        camera's depth image."""
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height) - camera.cy) / camera.fy
+        return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
+
+
+def flat(plane: Plane) -> SupportSurface:
+    """A plane that is not known to be bent."""
+    return SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
+
+
+def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
+    """The surface that a plane was seen as.
+
+    Parameters
+    ----------
+    plane
+        Found in this image.
+    depth, valid : (height, width)
+        Metres, and where they are a measurement.
+    camera
+        A pinhole camera.
+    """
+    k = max(1, min(depth.shape) // _SAMPLES)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    z = points[:, 2]
+    x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
+    height = plane.height(points) / growth
+    on = np.abs(height) < TOLERANCE
+    if not on.any():
+        return flat(plane)
+    limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
+    bend, off = np.zeros(_TERMS), height
+    for _ in range(6):
+        gram, right = _normal_equations(x, y, height, off)
+        if gram[0, 0] < 10 * _TERMS:
+            return flat(plane)
+        bend = np.linalg.lstsq(gram, right, rcond=None)[0]
+        off, is_settled = _off(x, y, height, bend, limit, off)
+        if is_settled:
+            break
+    within = np.abs(off)
+    return SupportSurface(plane, bend, limit, deviation(within[within < TOLERANCE]))
+
+
+@kernel
+def _normal_equations(
+    x: np.ndarray, y: np.ndarray, height: np.ndarray, off: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The normal equations of b by least squares, from the heights of samples within the tolerance of the last b."""
+    gram, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
+    for i in range(len(x)):
+        if abs(off[i]) < TOLERANCE:
+            term = (1.0, x[i], y[i], x[i] * x[i], x[i] * y[i], y[i] * y[i])
+            for j in range(_TERMS):
+                right[j] += term[j] * height[i]
+                for k in range(_TERMS):
+                    gram[j, k] += term[j] * term[k]
+    return gram, right
+
+
+@kernel
+def _off(
+    x: np.ndarray, y: np.ndarray, height: np.ndarray, bend: np.ndarray, limit: float, last: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """Heights above a bent support, and whether those within the tolerance are the same as last time."""
+    off, is_same = np.empty_like(height), True
+    for i in range(len(x)):
+        b = bend[0] + x[i] * (bend[1] + bend[3] * x[i] + bend[4] * y[i]) + y[i] * (bend[2] + bend[5] * y[i])
+        off[i] = height[i] - min(max(b, -limit), limit)
+        is_same &= (abs(off[i]) < TOLERANCE) == (abs(last[i]) < TOLERANCE)
+    return off, is_same
+
+
+@kernel
+def _relative(
+    depth: np.ndarray, x: np.ndarray, y: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float
+) -> np.ndarray:
+    """The rest of a row is constant, and no pixel branches: a row becomes vector code."""
+    height = np.empty(depth.shape, np.float32)
+    for v in range(depth.shape[0]):
+        slope, first = plane[1] * y[v] + plane[2], bend[0] + y[v] * (bend[2] + bend[5] * y[v])
+        second = bend[1] + bend[4] * y[v]
+        for u in range(depth.shape[1]):
+            z = np.float64(depth[v, u])
+            above = z * (plane[0] * x[u] + slope) + plane[3]
+            off = first + x[u] * (second + bend[3] * x[u])
+            relative = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
+            height[v, u] = relative if z > 0 else 0.0
+    return height

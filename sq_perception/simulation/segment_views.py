@@ -11,7 +11,7 @@ belongs to the object if its pixel shows the object and its error is at most 10 
 edges.
 
 The network also learns whether a segment is one object.  So the views include compact pieces of segments
-(:mod:`~sq_perception.segmentation.pieces`) and of two merged neighbours, each with the object that it shows; the rest
+and of two merged neighbours, each with the object that it shows; the rest
 of the segment counts as other segments.  For a segment of several objects there is a view of each one's part. """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 from sq_perception.imaging import regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
-from sq_perception.segmentation import pieces, segments
+from sq_perception.segmentation import segments
 from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.simulation import furniture, scenes, sensor_noise, thing_views
 from sq_perception.simulation.camera_stages import Stages
@@ -151,7 +151,7 @@ def _views_of_pieces(
     segment = view.image[..., segment_view.SEGMENT] > 0
     some, of = [], []
     count, (row, column) = int(rng.integers(3, 7)), rng.uniform(0, segment_view.PIXELS, 2)
-    numbers = pieces.compact(segment, count, (row, column))
+    numbers = segment_view.compact_pieces(segment, count, (row, column))
     for number in range(numbers.max() + 1):
         piece = numbers == number
         counts = np.bincount(cells[piece & known & (cells >= 0)], minlength=1)

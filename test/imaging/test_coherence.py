@@ -63,16 +63,16 @@ def test_a_neighbour_that_goes_on_beyond_the_mask_goes() -> None:
     np.testing.assert_array_equal(coherent(depth, mask, JUMP), mask & (depth == 0.7))
 
 
-NEAR, FAR = 0.03, 0.3
+NEAR = 0.03
 
 
 def test_borders_count_contacts_by_how_far_the_two_are_apart():
     labels = np.array([[1, 1, 2, 2], [1, 1, 2, 2], [1, 1, 2, 2]], np.int32)
     depth = np.where(labels == 1, 1.0, np.array([[1.01], [1.1], [1.5]])).astype(np.float32)
-    met, beside, behind = regions.borders(labels, depth, 2, NEAR, FAR)
+    met, beside, behind = regions.borders(labels, depth, 2, NEAR)
     assert met[1, 2] == met[2, 1] == 3
     assert beside[1, 2] == beside[2, 1] == 1, "the first row, 1 cm apart"
-    assert behind[2, 1] == 1, "the second row: the first one is no step, the third one too deep"
+    assert behind[2, 1] == 2, "the first row is no step"
     assert behind[1, 2] == 0
     # Each 2 x 3 pixels, with one side on the other.
     assert met[0, 1] == met[0, 2] == 2 + 3 + 2
@@ -81,11 +81,11 @@ def test_borders_count_contacts_by_how_far_the_two_are_apart():
 def test_contacts_go_across_pixels_without_a_depth():
     labels = np.array([[1, 0, 0, 2]], np.int32)
     depth = np.array([[1.0, 0.0, 0.0, 1.2]], np.float32)
-    met, beside, behind = regions.borders(labels, depth, 2, NEAR, FAR)
+    met, beside, behind = regions.borders(labels, depth, 2, NEAR)
     assert met[1, 2] == 1
     assert beside[1, 2] == 0
     assert behind[2, 1] == 1
     depth[0, 1:3] = 2.0
-    met, _, behind = regions.borders(labels, depth, 2, NEAR, FAR)
+    met, _, behind = regions.borders(labels, depth, 2, NEAR)
     assert met[1, 2] == 0
     assert not behind.any(), "nothing is behind what has no label"

@@ -19,8 +19,7 @@ from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_plane import Plane
-from sq_perception.segmentation.support_surface import flat
+from sq_perception.segmentation.support_plane import Plane, flat
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.scenes import plane_depth

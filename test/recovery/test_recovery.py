@@ -24,8 +24,7 @@ from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.support_plane import Plane
-from sq_perception.segmentation.support_surface import flat
+from sq_perception.segmentation.support_plane import Plane, flat
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)

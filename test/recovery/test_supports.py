@@ -14,8 +14,7 @@ from sq_perception.imaging import raycast
 from sq_perception.recovery import seen_object, supports
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.segments import from_labels
-from sq_perception.segmentation.support_plane import Plane
-from sq_perception.segmentation.support_surface import flat
+from sq_perception.segmentation.support_plane import Plane, flat
 from sq_perception.simulation.scenes import plane_depth
 
 LOW_BOX = (0.12, 0.1, 0.04)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou, ious
 
-from sq_perception.segmentation import level_faces, support_plane, support_surface
+from sq_perception.segmentation import level_faces, support_plane
 from sq_perception.segmentation.segments import segment
 from sq_perception.simulation import sensor_noise
 
@@ -56,7 +56,7 @@ def supported(depth):
     """The support of an image, and its depth with 0 where there is none."""
     valid = np.isfinite(depth)
     known = np.where(valid, depth, np.float32(0))
-    return support_surface.measured(support_plane.planes(depth, valid, VGA)[0], known, valid, VGA), known
+    return support_plane.measured(support_plane.planes(depth, valid, VGA)[0], known, valid, VGA), known
 
 
 def faces(labels, known, support):

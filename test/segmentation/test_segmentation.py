@@ -14,8 +14,7 @@ from sq_perception.recordings.frame_file import read
 from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.segments import from_labels, segment, support_under
-from sq_perception.segmentation.support_plane import Plane
-from sq_perception.segmentation.support_surface import flat
+from sq_perception.segmentation.support_plane import Plane, flat
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 

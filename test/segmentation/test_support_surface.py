@@ -11,9 +11,8 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import support_plane, support_surface
-from sq_perception.segmentation.extent import largest_edge
-from sq_perception.segmentation.options import SegmentationOptions
+from sq_perception.segmentation import support_plane
+from sq_perception.segmentation.options import SegmentationOptions, largest_edge
 from sq_perception.segmentation.segments import from_labels, proposed, segment
 from sq_perception.simulation.scenes import plane_depth
 
@@ -79,12 +78,12 @@ def test_the_bend_is_measured_and_a_flat_table_has_next_to_none():
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
     plane = support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
-    surface = support_surface.measured(plane, depth, np.isfinite(depth), CAMERA)
+    surface = support_plane.measured(plane, depth, np.isfinite(depth), CAMERA)
     expected = -bulge * CAMERA.fx**2 / (CAMERA.cx**2 + CAMERA.cy**2) / away**2
     assert surface.bend[[3, 5]] == pytest.approx([expected, expected], rel=0.15)
     assert surface.sigma == pytest.approx(5e-4, rel=0.25)
     flat = noisy(np.full((240, 320), away), 5e-4)
-    surface = support_surface.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA)
+    surface = support_plane.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA)
     assert np.abs(surface.bend).max() < 0.02 * abs(expected)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sq_perception.segmentation import pieces
+from sq_perception.imaging.segment_view import compact_pieces
 
 
 def square(side: int) -> np.ndarray:
@@ -17,7 +17,7 @@ def square(side: int) -> np.ndarray:
 @pytest.mark.parametrize("count", [1, 3, 4, 6])
 def test_they_are_a_partition(count: int) -> None:
     cells = square(24)
-    found = pieces.compact(cells, count, (0.0, 0.0))
+    found = compact_pieces(cells, count, (0.0, 0.0))
     np.testing.assert_array_equal(found >= 0, cells)
     sizes = np.bincount(found[cells])
     assert len(sizes) == count
@@ -25,7 +25,7 @@ def test_they_are_a_partition(count: int) -> None:
 
 
 def test_four_of_a_square_are_its_quarters() -> None:
-    found = pieces.compact(square(24), 4, (0.0, 0.0))
+    found = compact_pieces(square(24), 4, (0.0, 0.0))
     assert np.bincount(found[found >= 0]).tolist() == [144] * 4
     for number in range(4):
         rows, columns = np.nonzero(found == number)
@@ -34,4 +34,4 @@ def test_four_of_a_square_are_its_quarters() -> None:
 
 def test_no_more_pieces_than_cells() -> None:
     cells = square(1)
-    assert pieces.compact(cells, 4, (20.0, 20.0))[cells].tolist() == [0]
+    assert compact_pieces(cells, 4, (20.0, 20.0))[cells].tolist() == [0]
