@@ -48,9 +48,9 @@ from known_frames import camera_of
 from sq_perception.fitting import course as tolerant
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
-from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
+from sq_perception.fitting.priors import HullPrior
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import methods
 from sq_perception.recovery.recoverer import Recoverer

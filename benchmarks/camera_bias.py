@@ -37,7 +37,7 @@ from common.scene_verdict import HALF
 from common.tabletop import Placed, Tabletop
 
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.priors import HullPrior
 from sq_perception.recovery import methods
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.recovery.seen_object import SeenObject

@@ -29,7 +29,7 @@ import household_things
 import numpy as np
 from common import report, scene_verdict, tabletop
 
-from sq_perception.fitting.covariance import undetermined
+from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.union import move

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from sq_perception.imaging.raycast import render
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.frame_file import read as read_frame
-    from sq_perception.recovery.crops import recover_crops
     from sq_perception.recovery.decomposition import decompose
     from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
+    from sq_perception.recovery.workers import recover_crops
 
 __all__ = [
     "Camera",
@@ -75,7 +75,7 @@ _HOMES = {
     "iou": "geometry.metrics:volume_iou",
     "mesh": "geometry.mesh",
     "read_frame": "recordings.frame_file:read",
-    "recover_crops": "recovery.crops",
+    "recover_crops": "recovery.workers",
     "recovery_figure": "evaluation.recovery_figure",
     "render": "imaging.raycast",
     "sample": "geometry.mesh",

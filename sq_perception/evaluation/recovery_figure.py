@@ -12,8 +12,8 @@ from matplotlib.patches import Rectangle
 
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
-from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
+from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.mesh import outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera

@@ -7,9 +7,13 @@ thing   It strays from one by m, a part of it alike: it counts as few independen
 Both are one cost with other terms (docs/surface_fit.md), and one search with other stages.  How much a thing misfits is
 estimated with its body: with c the mean loss of its rays it counts as INDEPENDENT / max(1, c / EXPLAINED) of them,
 since the likelihood maximised over an unknown variance divides by the variance found; and the more it misfits, the more
-it is drawn to a predicted hull (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  That pull does not count
+it is drawn to a predicted hull (:meth:`~sq_perception.fitting.priors.HullPrior.root`).  That pull does not count
 towards the covariance, and there rays count as fewer by the same factor once more: larger errors extend over larger
 parts, such as a neck, a spout or a dent.
+
+The outline: free rays beside the mask show where the body ends.  If the mask lost its edge (sensors lose what they see
+at grazing angles), the body covers pixels that were taken for free all around it: those are left out.  What the body
+then still covers determines the standard deviation of the outline.
 
 A thing is fitted as its convex hull, which encloses lids below a rim, necks and handles: points behind the surface
 count by Cauchy's loss, and space within the outline's convex hull may be empty.
@@ -25,14 +29,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import outline
-from sq_perception.fitting.cost import Terms
+from sq_perception.fitting.cost import SAMPLE, Rays, Terms
 from sq_perception.fitting.fit import INLIER
-from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import (
     BASIN,
     COARSE,
+    SETTLE,
     SLACK,
     STEPS,
     THING,
@@ -41,11 +44,11 @@ from sq_perception.fitting.multistart import (
     by_cost,
     within_doubt,
 )
-from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.observation import BAND_PIXELS, Observation
 from sq_perception.fitting.options import MODEL_ERROR, TAPER, FitOptions, limits
-from sq_perception.fitting.rays import SAMPLE
-from sq_perception.fitting.residuals import mean_loss, surface_distance
-from sq_perception.geometry.quantiles import deviation
+from sq_perception.fitting.priors import HullPrior
+from sq_perception.fitting.residuals import mean_loss, penetration, surface_distance
+from sq_perception.geometry.quantiles import deviation, quantile
 
 INDEPENDENT, EXPLAINED = 100.0, 0.5
 """Most rays that a thing counts as, and the mean loss up to which it does: what cartons and cans leave.  Chosen on
@@ -64,6 +67,15 @@ _FINE_NOISE = 0.3
 _OUTLIER = 5.0
 """Distance from the winner's surface, in standard deviations, beyond which object rays are dropped: noise reaches there
 once in two million.  Kept, they look like something left to explain, and other valleys are sought in vain."""
+_FEW_STEPS = 5
+"""Steps of a body once its outline is read."""
+_SHARP = 0.3
+"""Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels, a
+uniform error of up to half a pixel (1 / sqrt(12))."""
+_SHRUNK = 0.25
+"""Depth, in pixels: a body that covers half of the free pixels beside the mask this deep is larger than its mask."""
+_SHARPER = 0.7
+"""Factor of the last estimate of the outline's standard deviation that a new one must fall below for another round."""
 _HIT_TOLERANCE = 3e-3
 """Error of g where a ray meets the body.  A search remembers where that was, so that it vanishes as it converges."""
 _PLANE_SIGMA, _GAP_SIGMA, _REST_SIGMA = 0.001, 0.005, 0.05
@@ -160,12 +172,12 @@ def _on_all_rays(problem: Problem, finalists: Sequence[State]) -> Solution:
     space; the precision of its outline is read from its misfit."""
     favourite, *others = finalists
     if not problem.late:
-        problem, favourite = outline.without_shrunk_edge(problem, favourite)
+        problem, favourite = without_shrunk_edge(problem, favourite)
     enough = _enough_rays(problem.observation)
     rays = problem.draw(problem.options.pixels or enough, 0.3)
     rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
     few = problem.draw(enough // 4, 0.3)
-    problem, favourite = outline.sharpened(problem, favourite, rays.free, few)
+    problem, favourite = sharpened(problem, favourite, rays.free, few)
     settled = by_cost(problem.settle(state, few) for state in [favourite, *others])
     # Few rays do not tell these apart.
     near = [state for state in settled if state.cost <= settled[0].cost + SLACK]
@@ -228,3 +240,68 @@ def _mean_loss(problem: Problem, body: State) -> float:
     """Mean loss of the object's rays: c of the module."""
     rays = problem.observation.object_rays(SAMPLE, 0.1)
     return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
+
+
+# The outline of a superquadric
+
+
+def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
+    full = problem.observation
+    if _depth_inside(problem, state, full.ring(1)) < _SHRUNK:
+        return problem, state
+    problem = replace(problem, observation=full.beyond(BAND_PIXELS))
+    state = problem.refine(state, problem.draw(FINAL_RAYS, 0.6), SETTLE.steps)
+    rings = (k for k in range(1, BAND_PIXELS + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
+    band = next(rings, BAND_PIXELS + 1) - 1
+    return replace(problem, observation=full.beyond(band) if band > 0 else full), state
+
+
+def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
+    """Estimate the outline's precision from a body's misfit to free rays, and again from the better body it allows.
+
+    The precision does not fall: else pixels that miss a body would cost next to nothing, and it might leave them.
+    """
+    state, sigma = _pulled_in(problem, state, free, rays)
+    before = math.inf
+    while True:
+        sigma = min(sigma, problem.observation.outline)
+        if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
+            return problem, state
+        problem = problem.with_terms(outline_stiffness=1 / sigma)
+        state = problem.settle(state, rays, _FEW_STEPS)
+        before, sigma = sigma, _outline_sigma(problem, state, free)
+
+
+def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
+    """The body, refitted with its outline known to a pixel if it sticks out farther than assumed and that helps; and
+    how far the one returned sticks out, metres."""
+    sigma = _outline_sigma(problem, state, free)
+    if not sigma > problem.observation.outline or problem.late:
+        return state, sigma
+    pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
+    other = pixel.settle(state, rays)
+    nearer = _outline_sigma(problem, other, free)
+    return (other, nearer) if nearer < _SHARPER * sigma else (state, sigma)
+
+
+def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
+    """Depth, in pixels, to which the body covers half of these free pixels.
+
+    Half: a body that is merely too long covers those around the mask on one side only.
+    """
+    rays = problem.observation.free_rays_of(pixels)
+    if len(rays) == 0:
+        return 0.0
+    depth = penetration(rays, problem.terms, state.parameters, state.rotation)
+    return quantile(depth, 0.5) / problem.observation.footprint
+
+
+def _outline_sigma(problem: Problem, state: State, free: np.ndarray) -> float:
+    """Standard deviation of the outline, metres, from how far the body reaches into free rays beside the mask."""
+    sharp = _SHARP * problem.observation.footprint
+    if len(free) == 0:
+        return sharp
+    depth = penetration(free, problem.terms, state.parameters, state.rotation)
+    reached = depth[depth > 0]
+    return max(sharp, float(np.sqrt(np.mean(reached**2)))) if len(reached) else sharp

@@ -14,8 +14,17 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.cost import LANES, Terms
-from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
+from sq_perception.fitting.cost import (
+    DEPTH,
+    DIRECTION_X,
+    DIRECTION_Y,
+    LANES,
+    ORIGIN_X,
+    ORIGIN_Y,
+    STIFFNESS,
+    WEIGHT,
+    Terms,
+)
 from sq_perception.geometry.kernels import Form, gauge_derivatives, in_object_frame, inline_kernel, inside_box, kernel
 
 QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)

@@ -15,8 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.cost import PARAMETERS, STEP_LENGTH, Terms
-from sq_perception.fitting.rays import DEPTH
+from sq_perception.fitting.cost import DEPTH, PARAMETERS, STEP_LENGTH, Terms
 from sq_perception.fitting.residuals import evaluate
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import inline_kernel, kernel

@@ -24,13 +24,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.cost import Terms
-from sq_perception.fitting.covariance import UNTAPERED, Alternative, covariance_at
-from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.cost import SAMPLE, WEIGHT, Rays, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
-from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
+from sq_perception.fitting.priors import HullPrior
+from sq_perception.fitting.quality import UNTAPERED, Alternative, covariance_at
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.geometry.superquadric import Superquadric
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.priors import HullPrior
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -76,7 +76,7 @@ class FitOptions:
         A body in the optical frame, or a function that returns it, that limits how large the object may be where the
         image does not: the prediction of a network.  A wide prior with long tails; asked for only where it matters.
     hull
-        What is known of the thing's convex hull (:mod:`sq_perception.fitting.hull_prior`), or a function that returns
+        What is known of the thing's convex hull (:mod:`sq_perception.fitting.priors`), or a function that returns
         it: asked for only where no superquadric explains the image down to its noise.
     nan_is_empty
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw

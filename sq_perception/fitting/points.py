@@ -24,12 +24,11 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from sq_perception.fitting import point_cost
-from sq_perception.fitting.covariance import carried_over
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import EXPONENTS, LARGEST_SIZE, MIN_PIXELS, SMALLEST_SIZE
 from sq_perception.fitting.point_cloud import UnitCloud, finite_points
 from sq_perception.fitting.point_cost import BODY_LENGTH, STEP_LENGTH, Cloud, Course, Mixture, Prior
-from sq_perception.fitting.quality import seen_extents
+from sq_perception.fitting.quality import carried_over, seen_extents
 from sq_perception.fitting.quality import status as assess
 from sq_perception.fitting.starts import ORDERS
 from sq_perception.geometry import rotation as quaternions

@@ -11,7 +11,7 @@ point p of the optical frame, with q = R^T (p - t) in the object frame, the gaug
 
 Residuals
 ---------
-A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; :mod:`sq_perception.fitting.rays` names the columns of its row.
+A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; :mod:`sq_perception.fitting.cost` names the columns of its row.
 
 classic     sqrt(a1 a2 a3) (g^2 - 1) / sigma at the measured point: Solina and Bajcsy's, as g^2 = F^e1.
 Sampson     (g - 1) / (|grad g| sigma) at the measured point: first order distance; wide basin of attraction.
@@ -35,7 +35,7 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.cost import LANES, STEP_LENGTH, Terms, add_block, cauchy_loss, huber_loss
+from sq_perception.fitting.cost import LANES, STEP_LENGTH, STIFFNESS, Terms, add_block, cauchy_loss, huber_loss
 from sq_perception.fitting.intersection import (
     EX,
     EY,
@@ -67,7 +67,6 @@ from sq_perception.fitting.intersection import (
     place,
 )
 from sq_perception.fitting.priors import prior_cost
-from sq_perception.fitting.rays import STIFFNESS
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2

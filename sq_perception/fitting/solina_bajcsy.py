@@ -27,11 +27,10 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting.cost import Terms
+from sq_perception.fitting.cost import DEPTH, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT, Terms
 from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.options import MIN_PIXELS, limits
-from sq_perception.fitting.rays import DEPTH, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
 from sq_perception.fitting.residuals import CLASSIC
 from sq_perception.fitting.starts import on_one_line
 from sq_perception.geometry import rotation as quaternions

@@ -57,7 +57,7 @@ ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
     """A valid box-like body around any points (n >= 1, 3): the best that is known when no fit is possible."""
     centre = points.mean(axis=0)
-    axes = _axes_of(points)
+    axes = principal_axes(_scatter(points))
     local = (points - centre) @ axes
     low, high = local.min(axis=0), local.max(axis=0)
     size = np.maximum((high - low) / 2, max(footprint, 1e-6))
@@ -66,14 +66,13 @@ def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
 
 def on_one_line(points: np.ndarray) -> bool:
     """Whether points (n >= 1, 3) spread along one direction only."""
-    centred = points - points.mean(axis=0)
-    spread = np.linalg.eigvalsh(centred.T @ centred)
+    spread = np.linalg.eigvalsh(_scatter(points))
     return bool(spread[1] <= 1e-6 * spread[2])
 
 
 def principal(points: np.ndarray, deeper: bool = True) -> list[State]:
     """Boxes along the principal axes of the points, for each choice of z; deeper on the narrow side if asked for."""
-    axes = _axes_of(points)
+    axes = principal_axes(_scatter(points))
     low, high = span(points, axes.T).T
     found = _ordered(low, high, axes)
     if not deeper:
@@ -103,11 +102,9 @@ def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     first = np.array([y, -x, 0.0] if abs(z) < 0.9 else [0.0, z, -y])  # across z, or across x
     first /= np.linalg.norm(first)
     second = quaternions.cross(normal, first)
-    flat = np.empty((len(points), 2), np.float32)
-    flat[:, 0], flat[:, 1] = points @ first, points @ second
-    (_, _), (_, _), angle = cv2.minAreaRect(flat)
+    _, _, angle = cv2.minAreaRect((points @ np.column_stack([first, second])).astype(np.float32))
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-    return np.stack([c * first + s * second, -s * first + c * second, normal], axis=1)
+    return np.column_stack([c * first + s * second, -s * first + c * second, normal])
 
 
 def three_orders(axes: np.ndarray) -> list[np.ndarray]:
@@ -123,9 +120,9 @@ def principal_axes(moments: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _axes_of(points: np.ndarray) -> np.ndarray:
+def _scatter(points: np.ndarray) -> np.ndarray:
     centred = points - points.mean(axis=0)
-    return principal_axes(centred.T @ centred)
+    return np.asarray(centred.T @ centred)
 
 
 def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]:

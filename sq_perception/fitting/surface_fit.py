@@ -33,14 +33,13 @@ from typing import Literal
 import numpy as np
 
 from sq_perception.fitting import course, starts, valleys
-from sq_perception.fitting.covariance import WEAK_SHARE, Alternative
 from sq_perception.fitting.fit import Fit
-from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import Problem, Solution
 from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, check_plane
-from sq_perception.fitting.quality import assessed, failed
+from sq_perception.fitting.priors import HullPrior
+from sq_perception.fitting.quality import WEAK_SHARE, Alternative, assessed, failed
 from sq_perception.geometry.quantiles import deviation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS

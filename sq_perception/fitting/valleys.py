@@ -27,11 +27,11 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting import starts
-from sq_perception.fitting.covariance import Alternative, undetermined
+from sq_perception.fitting.cost import DEPTH, Rays
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import SETTLE, SIGNIFICANT, SLACK, Problem, Solution, alike, by_cost
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.rays import DEPTH, Rays
+from sq_perception.fitting.quality import Alternative, undetermined
 from sq_perception.fitting.starts import resized
 from sq_perception.geometry.kernels import kernel
 

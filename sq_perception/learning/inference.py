@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.priors import HullPrior
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_torch_thread

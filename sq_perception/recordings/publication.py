@@ -28,8 +28,8 @@ from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.markers import Mesh as MarkerMesh
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
-from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
+from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import compressed_depth, depth_units, unit_cube

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from sq_perception.files import __version__, output_file
-from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Parts, Status
+from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.recordings.frame_file import RecordedFrame, Stamp

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting import solina_bajcsy, surface_fit
-from sq_perception.fitting.covariance import undetermined
+from sq_perception.fitting.cost import SAMPLE
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, PlaneError
-from sq_perception.fitting.rays import SAMPLE
+from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera

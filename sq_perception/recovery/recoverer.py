@@ -42,13 +42,12 @@ from sq_perception.imaging import depth_units, hole_filling, ranges, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.recovery import methods, parts, prediction, seen_object, supports
+from sq_perception.recovery import methods, parts, seen_object, supports
 from sq_perception.recovery.cavities import find_cavity
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
-from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.recovery.seen_object import Prediction, SeenObject
 from sq_perception.segmentation import segments
 from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.objectness import LEAST_OF_ITS_OWN, of_its_own
@@ -345,11 +344,12 @@ class Recoverer:
         if isinstance(network, inference.ThingPredictor):
 
             def of_some(some: Sequence[int]) -> list[Prediction]:
-                return prediction.of_hulls([views[k] for k in some], [objects[k].plane for k in some], network, mirror)
+                planes = [objects[k].plane for k in some]
+                return seen_object.predict_hulls([views[k] for k in some], planes, network, mirror)
 
             found = self._shared(of_some, range(len(views)))
         else:
-            found = prediction.of_bodies(views, network, when_asked=options.method == "auto")
+            found = seen_object.predict_bodies(views, network, when_asked=options.method == "auto")
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _find_parts(

@@ -8,8 +8,8 @@ from table_scenes import VGA, Table
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.options import MODEL_ERROR, FitOptions
+from sq_perception.fitting.priors import HullPrior
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sq_perception.fitting import depth_noise, surface_fit
+from sq_perception.fitting import observation, surface_fit
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
@@ -20,7 +20,7 @@ def slope(rng: np.random.Generator, sigma: float) -> np.ndarray:
 
 @pytest.mark.parametrize("sigma", [1e-4, 1e-3, 5e-3])
 def test_gaussian_noise_on_a_slope(sigma: float, rng: np.random.Generator) -> None:
-    found = depth_noise.estimate(slope(rng, sigma).astype(np.float32), INSIDE, 1e-6)
+    found = observation.estimate_noise(slope(rng, sigma).astype(np.float32), INSIDE, 1e-6)
     assert found.sigma == pytest.approx(sigma, rel=0.1)
     assert found.quantum == 0
 
@@ -29,14 +29,14 @@ def test_gaussian_noise_on_a_slope(sigma: float, rng: np.random.Generator) -> No
 def test_noise_of_whole_steps_is_no_multiple_of_a_step(levels: float, rng: np.random.Generator) -> None:
     step = 1 / 256
     depth = np.round(slope(rng, levels * step) / step) * step
-    found = depth_noise.estimate(depth.astype(np.float32), INSIDE, 1e-6)
+    found = observation.estimate_noise(depth.astype(np.float32), INSIDE, 1e-6)
     assert found.sigma == pytest.approx(np.hypot(levels, 1 / np.sqrt(12)) * step, rel=0.08)
     assert found.quantum == 0
 
 
 def test_rounding_alone(rng: np.random.Generator) -> None:
     step = 1 / 256
-    found = depth_noise.estimate((np.round(slope(rng, 0.0) / step) * step).astype(np.float32), INSIDE, 1e-6)
+    found = observation.estimate_noise((np.round(slope(rng, 0.0) / step) * step).astype(np.float32), INSIDE, 1e-6)
     assert found.sigma == pytest.approx(step / np.sqrt(12))
     assert found.quantum == pytest.approx(step)
 
@@ -47,7 +47,7 @@ def test_noise_of_less_than_half_a_step_joins_the_rounding(levels: float, rng: n
     step, (v, u) = 1 / 256, np.indices(INSIDE.shape)
     bowl = 200 + 0.02 * ((u - 80) ** 2 + (v - 60) ** 2)
     depth = np.round(bowl + levels * rng.standard_normal(INSIDE.shape)) * step
-    found = depth_noise.estimate(depth.astype(np.float32), INSIDE, 1e-6)
+    found = observation.estimate_noise(depth.astype(np.float32), INSIDE, 1e-6)
     assert found.sigma == pytest.approx(np.hypot(levels, 1 / np.sqrt(12)) * step, rel=0.15)
 
 
@@ -69,14 +69,14 @@ def test_a_fit_is_surer_with_less_noise_than_with_more_than_half_a_step() -> Non
 @pytest.mark.parametrize("shape", [(48, 48), (5, 300), (299, 4), (121, 7), (3, 3)])
 def test_images_of_any_shape(shape: tuple[int, int], rng: np.random.Generator) -> None:
     depth = (1 + 0.01 * rng.standard_normal(shape)).astype(np.float32)
-    found = depth_noise.estimate(depth, np.ones(shape, dtype=bool), 1e-6)
+    found = observation.estimate_noise(depth, np.ones(shape, dtype=bool), 1e-6)
     assert 0 < found.sigma < 0.1
 
 
 def test_outliers_do_not_count(rng: np.random.Generator) -> None:
     depth = slope(rng, 1e-3)
     depth[rng.random(depth.shape) < 0.02] += 0.3
-    assert depth_noise.estimate(depth.astype(np.float32), INSIDE, 1e-6).sigma == pytest.approx(1e-3, rel=0.25)
+    assert observation.estimate_noise(depth.astype(np.float32), INSIDE, 1e-6).sigma == pytest.approx(1e-3, rel=0.25)
 
 
 @pytest.mark.parametrize("noise", [0.0, -1.0, np.nan, np.inf])

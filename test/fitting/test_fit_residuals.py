@@ -10,18 +10,19 @@ import pytest
 import residual_statement as statement
 import torch
 
-from sq_perception.fitting.cost import STEP_LENGTH, Terms
-from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.rays import (
+from sq_perception.fitting.cost import (
     DEPTH,
     DIRECTION_X,
     DIRECTION_Y,
     ORIGIN_X,
     ORIGIN_Y,
     RAY_COLUMNS,
+    STEP_LENGTH,
     STIFFNESS,
     WEIGHT,
+    Terms,
 )
+from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.residuals import CLASSIC, RENDERED, SAMPSON, evaluate, penetration, surface_distance
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric

@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sq_perception.fitting import covariance, priors, surface_fit
-from sq_perception.fitting.cost import STEP_LENGTH, Terms
-from sq_perception.fitting.covariance import covariance_at
-from sq_perception.fitting.hull_prior import MODEL_SHARE, PULL_SHARE, HullPrior
+from sq_perception.fitting import priors, quality, surface_fit
+from sq_perception.fitting.cost import RAY_COLUMNS, STEP_LENGTH, Rays, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize, move
 from sq_perception.fitting.observation import Crop
-from sq_perception.fitting.priors import prior_cost
-from sq_perception.fitting.rays import RAY_COLUMNS, Rays
+from sq_perception.fitting.priors import MODEL_SHARE, PULL_SHARE, HullPrior, prior_cost
+from sq_perception.fitting.quality import covariance_at
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -234,5 +232,5 @@ def test_no_form_of_a_hull_is_compiled_for(
     forms = []
     for hull in (usual, single, fixed):
         surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane, model_error=0.0025, hull=hull))
-        forms.append([len(form.signatures) for form in (minimize, covariance._covariance, priors.hull_distances)])
+        forms.append([len(form.signatures) for form in (minimize, quality._covariance, priors.hull_distances)])
     assert forms[0] == forms[1] == forms[2]

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sq_perception.fitting import course, outline
+from sq_perception.fitting import course
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import Problem
 from sq_perception.fitting.observation import Crop
@@ -33,9 +33,9 @@ def problem_of(body: Superquadric) -> Problem:
 def test_a_reading_that_gets_no_smaller_is_the_last(monkeypatch: pytest.MonkeyPatch, readings: list[float]) -> None:
     problem = problem_of(BODY)
     left = iter(readings)
-    monkeypatch.setattr(outline, "_sigma", lambda *_: next(left))
+    monkeypatch.setattr(course, "_outline_sigma", lambda *_: next(left))
     rays = problem.draw(100, 0.3)
-    _, state = outline.sharpened(problem, State.of(BODY), rays.free, rays)
+    _, state = course.sharpened(problem, State.of(BODY), rays.free, rays)
     assert np.isfinite(state.parameters).all()
 
 
@@ -45,5 +45,5 @@ def test_a_body_that_sticks_out_loosens_no_outline(longer: float) -> None:
     problem = problem_of(BODY)
     body = Superquadric(longer * BODY.size, BODY.shape, BODY.translation, BODY.rotation)
     rays = problem.draw(500, 0.3)
-    read, _ = outline.sharpened(problem, State.of(body), rays.free, rays)
+    read, _ = course.sharpened(problem, State.of(body), rays.free, rays)
     assert read.terms.outline_stiffness >= problem.terms.outline_stiffness

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.rays import DEPTH, RAY_COLUMNS
+from sq_perception.fitting.cost import DEPTH, RAY_COLUMNS
 from sq_perception.fitting.valleys import faces_camera
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sq_perception.fitting import covariance, quality, surface_fit
+from sq_perception.fitting import quality, surface_fit
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import metrics
@@ -411,7 +411,7 @@ def test_an_inverse_of_information_is_a_covariance(rng: np.random.Generator) -> 
     """One direction known 10^10 times as well as another that is known from the prior alone."""
     axes, _ = np.linalg.qr(rng.normal(size=(11, 11)))
     values = np.r_[1e20, 1e12, np.full(9, 1.0)]
-    found = covariance._inverse((axes * values) @ axes.T, 1.0)
+    found = quality._inverse((axes * values) @ axes.T, 1.0)
     deviations = np.linalg.eigvalsh((found + found.T) / 2)
     assert deviations.min() > -1e-12
     assert deviations.max() <= 1 + 1e-9

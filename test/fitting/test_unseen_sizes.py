@@ -9,10 +9,9 @@ import pytest
 from table_scenes import Table
 
 from sq_perception.fitting import course, surface_fit
-from sq_perception.fitting.covariance import Alternative, spread
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.quality import seen_extents
+from sq_perception.fitting.quality import Alternative, seen_extents, spread
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from sq_perception.fitting import covariance as fit_covariance
+from sq_perception.fitting import quality
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
@@ -75,7 +75,7 @@ def draw(truth, covariance, rng, form=None, error=None):
     metres = state.scale_sizes(covariance, truth.size)
     form = rng.integers(8) if form is None else form
     other = seen.equivalent_forms()[int(form)]
-    return Seen(other, fit_covariance.carried_over(metres, seen, other))
+    return Seen(other, quality.carried_over(metres, seen, other))
 
 
 def exchanged(seen, turn):
