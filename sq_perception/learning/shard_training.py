@@ -170,7 +170,8 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
 
 def _shards(folder: Path, held: int) -> list[Path]:
     """The shards that a folder holds, in order; raises ValueError if there are none but those kept for validation."""
-    found = sorted(folder.glob("[!.]*.safetensors"))  # one that is being written is hidden
+    # One that is being written is NAME.partial.safetensors.
+    found = sorted(path for path in folder.glob("*.safetensors") if ".partial" not in path.suffixes)
     if len(found) <= held:
         raise ValueError(f"{folder}: expected more than {held} shards of views, found {len(found)}")
     return found
