@@ -25,7 +25,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.learning.choices import Framing
-from sq_perception.learning.positions import move_bodies, move_images
+from sq_perception.learning.inference import move_bodies, move_images
 from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
 from sq_perception.simulation.view_rendering import Occluder, render_views
 

@@ -15,9 +15,9 @@ import torch
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import checkpoint, inference, layout
 from sq_perception.learning.forward import CompactMasks, CompactRegressor, CompactThings
+from sq_perception.learning.inference import predict_in_positions
 from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig
 from sq_perception.learning.networks import MaskNetwork, Regressor, ThingNetwork
-from sq_perception.learning.positions import predict_in_positions
 
 FORMS = [
     RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32),

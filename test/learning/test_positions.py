@@ -6,7 +6,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.learning import positions
+from sq_perception.learning import inference
 from sq_perception.learning.dataset import draw_views
 from sq_perception.simulation import view_rendering
 
@@ -29,7 +29,7 @@ def test_moved_images_are_images_of_the_moved_bodies() -> None:
     rng = np.random.default_rng(4)
     images, bodies = draw_views(48, rng)
     turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
-    shown, moved = positions.move_images(images, turns, mirror), positions.move_bodies(bodies, turns, mirror)
+    shown, moved = inference.move_images(images, turns, mirror), inference.move_bodies(bodies, turns, mirror)
     again, _ = view_rendering.render_views(moved)
     assert ((again > 0) != (shown > 0)).mean() < 0.001
     assert np.abs(again - shown)[(again > 0) & (shown > 0)].mean() < 0.004
@@ -40,7 +40,7 @@ def test_the_mean_of_forms_of_a_body_is_the_body() -> None:
     bodies = random(20, rng)
     forms = bodies.equivalent_forms()[rng.integers(8, size=20), np.arange(20)]
     signed = Superquadric(forms.size, forms.shape, forms.translation, -forms.rotation)
-    found = positions.mean(answers(bodies, forms, signed))
+    found = inference.mean_body(answers(bodies, forms, signed))
     np.testing.assert_allclose(found.to_flat(), bodies.to_flat(), atol=1e-12)
 
 
@@ -48,7 +48,7 @@ def test_opposite_errors_cancel() -> None:
     bodies = random(20, np.random.default_rng(2))
     turn = np.array([np.sin(0.05), 0.0, 0.0, np.cos(0.05)])
     larger, smaller = changed(bodies, 1.1, 0.02, turn), changed(bodies, 1 / 1.1, -0.02, turn * [-1, -1, -1, 1])
-    mean = positions.mean(answers(larger, smaller))
+    mean = inference.mean_body(answers(larger, smaller))
     sign = np.sign((mean.rotation * bodies.rotation).sum(axis=1, keepdims=True))
     np.testing.assert_allclose(mean.size, bodies.size)
     np.testing.assert_allclose(mean.translation, bodies.translation)
@@ -59,7 +59,7 @@ def test_different_answers_are_not_mixed_and_the_one_that_has_most_counts() -> N
     bodies = random(20, np.random.default_rng(3))
     aside = changed(bodies, 1.5, 0.0, np.array([np.sin(0.35), 0, 0, np.cos(0.35)]))
     for shown, expected in (((bodies, aside), bodies), ((aside, bodies, bodies), bodies), ((aside, bodies), aside)):
-        found = positions.mean(answers(*shown))
+        found = inference.mean_body(answers(*shown))
         np.testing.assert_allclose(found.size, expected.size)
         np.testing.assert_allclose(found.rotation, expected.rotation)
 
@@ -77,6 +77,6 @@ def test_a_network_is_shown_four_positions_as_one_batch() -> None:
         ones = np.ones((len(batch), 1))
         return Superquadric(ones * [0.1, 0.2, 0.3], ones * [0.5, 0.5], place, ones * [0.0, 0.0, 0.0, 1.0])
 
-    found = positions.predict_in_positions(predict, views)
+    found = inference.predict_in_positions(predict, views)
     assert shown == [8]
     np.testing.assert_allclose(found.translation[:, :2], [[1.5 / 8, 4.5 / 8], [6.5 / 8, 2.5 / 8]])

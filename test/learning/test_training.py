@@ -22,8 +22,8 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
+from sq_perception.learning.inference import predict_in_positions
 from sq_perception.learning.networks import Regressor, RegressorConfig
-from sq_perception.learning.positions import predict_in_positions
 from sq_perception.learning.training import mixed_precision
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 from sq_perception.recovery.recoverer import Recoverer
