@@ -239,7 +239,7 @@ def test_demo_without_ros_says_what_is_missing():
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        ("train", ("--steps", "least_squares_free", "mse", "--tau", "What is minimised", "Views a step")),
+        ("train", ("--steps", "least_squares_free", "mse", "--points", "What is minimised", "Views a step")),
         ("evaluate", ("--fit-bodies", "report.md")),
     ],
 )
