@@ -146,6 +146,16 @@ def folder(text: str) -> Path:
     return Path(text)
 
 
+def write_document(option: str, path: str, text: str, is_whole: bool = True) -> str:
+    """Write a document to a file or, for -, to the standard output; return where else it is, if it is unfinished."""
+    if path == STANDARD_OUTPUT:
+        sys.stdout.write(text)
+        return ""
+    # Names of files need not be UTF-8.
+    written = output_file.write(path, text.encode(errors="backslashreplace"), is_whole)
+    return "" if written == Path(path) else f"--{option}: unfinished, so {path} stays as it is: see {written}"
+
+
 def replaced_input(
     inputs: Sequence[Path], files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,

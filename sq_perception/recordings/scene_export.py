@@ -106,14 +106,8 @@ def write(
 ) -> list[Path]:
     """Write n bodies (n,) as a scene; the files, those of meshes behind the scene's.  ValueError as :func:`solids`.
 
-    Parameters
-    ----------
-    form
-        urdf, sdf, mjcf or curobo.
-    frame
-        The link of a URDF that the bodies are fixed to.
-    meshes
-        Close meshes instead of the smallest enclosing solids.
+    ``form``: urdf, sdf, mjcf or curobo.  ``frame``: the link of a URDF that the bodies are fixed to.  ``meshes``: close
+    meshes instead of the smallest enclosing solids.
     """
     import trimesh
 
