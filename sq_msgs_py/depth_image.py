@@ -43,7 +43,7 @@ class ImageError(ValueError):
 
 
 def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYPES)) -> np.ndarray:
-    """The pixels (height, width) of a single-channel image as they lie in the message: a view, nothing is copied.
+    """Return the pixels (height, width) of a single-channel image as they lie in the message: a view, no copy.
 
     Rows may be padded (``step``) and bytes may be swapped (``is_bigendian``); the array's strides and dtype follow.
     Raises ImageError if the encoding is none of ``encodings``, the image is empty, the step is shorter than a row, or
@@ -163,7 +163,7 @@ class RawIntrinsics:
 
 
 def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
-    """Intrinsics of the rectified image that travels with a camera_info; region of interest and binning are applied.
+    """Return intrinsics of the rectified image of a camera_info; region of interest and binning are applied.
 
     The projection matrix P counts, and K where P is not set; both describe the full resolution.  For an image that is
     not rectified see :func:`raw_intrinsics_from_message`.  Raises ImageError if the camera is not calibrated (K and P
@@ -176,7 +176,7 @@ def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
 
 
 def raw_intrinsics_from_message(message: CameraInfo) -> RawIntrinsics:
-    """K and distortion of the raw image that travels with a camera_info; region of interest and binning are applied.
+    """Return K and distortion of the raw image of a camera_info; region of interest and binning are applied.
 
     K describes the full resolution.  Distortion acts on rays before they become pixels, so that a part of the image or
     binned pixels have the same.  Raises ImageError if the camera is not calibrated (K zero or not finite), the image
@@ -248,7 +248,7 @@ def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTyp
 
 
 def byte_array(pixels: np.ndarray) -> array.array[int]:
-    """The bytes of an array as array.array('B'), the one type that message setters take over without looking at it."""
+    """Return an array's bytes as array.array('B'), the one type that message setters take over without a look."""
     data = array.array("B")
     data.frombytes(np.ascontiguousarray(pixels).reshape(-1).view(np.uint8).data)
     return data

@@ -131,7 +131,7 @@ def enclosing_factor(
 def support(
     normals: np.ndarray, size: np.ndarray, shape: np.ndarray, taper: np.ndarray | tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """How far a body reaches from its centre along directions (k, 3) of its own frame: (k,), times their lengths."""
+    """Return how far a body reaches from its centre along directions (k, 3) of its own frame, times their lengths."""
     if np.any(taper):
         return _of_sections(normals * size, (float(shape[0]), float(shape[1])), np.asarray(taper, dtype=float))
     x, y, z = np.abs(normals * size).T

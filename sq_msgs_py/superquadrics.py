@@ -158,7 +158,7 @@ class SuperquadricArray(Columns):
 
 
 def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
-    """The message of n superquadrics (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
+    """Return the message of n superquadrics (n may be 0) with this std_msgs/Header, of the classes in ``types``."""
     return columns.to_message(superquadrics, header, types)
 
 

@@ -138,7 +138,7 @@ class RecordedBag:
         self._opened.close()
 
     def __len__(self) -> int:
-        """Return images that will be read, as the bag counts them; a damaged bag may count wrong."""
+        """Return how many images will be read, as the bag counts them; a damaged bag may count wrong."""
         count = sum(
             max(0, connection.msgcount) for connection in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
         )

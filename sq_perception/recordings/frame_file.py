@@ -127,7 +127,7 @@ class Reading:
             raise ValueError(f"region: expected left, top >= 0 and width, height >= 1, got {self.region}")
 
     def z(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Depth along the optical axis of a rectified image of this kind.  ValueError where a cloud was announced."""
+        """Return depth along the optical axis of a rectified image of this kind; ValueError for an announced cloud."""
         if self.frame is not None:
             raise ValueError("frame: expected a cloud, got a depth image, which is in the frame of its camera")
         return depth_units.z_from_range(depth, camera) if self.kind == "range" else depth

@@ -68,7 +68,7 @@ class Identified:
     columns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def summary(self, is_cube: bool) -> str:
-        """One frame's results in a line: ids, status words and full edges, of the unit cube or in millimetres."""
+        """Return the results in a line: ids, status words and full edges, of the unit cube or in millimetres."""
         recovery = self.recovery
         remark = f": {recovery.message}" if recovery.message else ""
         took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms{remark}"
@@ -282,7 +282,7 @@ def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageT
 def depth_of(
     message: Any, is_cube: bool, scale: float | None = None, known: Stated | None = None
 ) -> tuple[Metres, str]:
-    """Return depth of an image message, and its encoding before it was packed.
+    """Return the depth of an image message, and its encoding before it was packed.
 
     ``message``: sensor_msgs/Image of 16UC1 or 32FC1, or CompressedImage of the compressedDepth transport; if
     ``is_cube`` Image of mono8 or mono16, grey values of the unit cube.  ``scale``, ``known``: units, as
