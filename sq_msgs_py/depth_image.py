@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import CameraInfo, Image
@@ -85,7 +85,7 @@ def labels_from_message(message: Image) -> np.ndarray:
     return np.maximum(labels, 0, out=labels)
 
 
-def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", types: MessageTypes = installed) -> Image:
+def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", types: MessageTypes = find_type) -> Image:
     """Return an image message of depth (height, width) in metres.
 
     32FC1 holds the values as they are.  16UC1 holds the nearest millimetre; what is not finite, below half a
@@ -104,7 +104,7 @@ def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", ty
     raise ImageError(f"encoding: expected {' or '.join(DEPTH_ENCODINGS)}, got {encoding!r}")
 
 
-def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = installed) -> Image:
+def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = find_type) -> Image:
     """Return a mono8 or mono16 message of uint8 or uint16 grey values (height, width).
 
     Raises ImageError for another dtype or not two dimensions.
@@ -117,7 +117,7 @@ def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = install
 
 
 def labels_to_message(
-    labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = installed
+    labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = find_type
 ) -> Image:
     """Return a label image message of integer labels (height, width).
 
@@ -232,7 +232,7 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
     )
 
 
-def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = installed) -> CameraInfo:
+def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = find_type) -> CameraInfo:
     """Return a camera_info without distortion: K, R = I and P of the intrinsics."""
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     return types("sensor_msgs/msg/CameraInfo")(

@@ -20,7 +20,7 @@ import numpy as np
 
 from sq_msgs_py import columns
 from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.poses import matrices, poses_at, product, unit_quaternions
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ class GraspArray(Columns):
     id: np.ndarray = field(metadata=column("id"))
 
 
-def to_message(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
+def to_message(grasps: GraspArray, header: Any, types: MessageTypes = find_type) -> PointCloud2:
     """Return the message of n grasps (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
     return columns.to_message(grasps, header, types)
 
@@ -65,7 +65,7 @@ def from_message(message: PointCloud2) -> GraspArray:
     return columns.from_message(GraspArray, message, [name for name, _ in FIELDS])
 
 
-def poses(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PoseArray:
+def poses(grasps: GraspArray, header: Any, types: MessageTypes = find_type) -> PoseArray:
     """Return the poses alone as a geometry_msgs/PoseArray, in the same order."""
     found = poses_at(grasps.position, grasps.rotation, types)
     return types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
@@ -77,7 +77,7 @@ APPROACH, LEAST_APPROACH = 0.1, 0.05
 
 def moveit_grasps(
     grasps: GraspArray, header: Any, link: str, link_from_tcp: tuple[Sequence[float], Sequence[float]],
-    up: Sequence[float] | None, prefix: str, joints: Sequence[str] = (), types: MessageTypes = installed,
+    up: Sequence[float] | None, prefix: str, joints: Sequence[str] = (), types: MessageTypes = find_type,
 ) -> list[Grasp]:
     """Return a moveit_msgs/Grasp for each, in the same order; its quality is the score.
 

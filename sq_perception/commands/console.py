@@ -85,7 +85,7 @@ def with_negatives(arguments: Sequence[str]) -> list[str]:
 def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
     """Return the argument type of a whole number from ``least`` to ``most``, or without an upper bound."""
 
-    def checked(text: str) -> int:
+    def check(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
@@ -96,13 +96,13 @@ def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(f"expected {least} to {most}, got {value}")
         return value
 
-    return checked
+    return check
 
 
 def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float]:
     """Return the argument type of a number for which ``holds`` is true; ``wanted`` names it in complaints."""
 
-    def checked(text: str) -> float:
+    def check(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
@@ -111,7 +111,7 @@ def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float
             raise argparse.ArgumentTypeError(f"expected {wanted}, got {text}")
         return value
 
-    return checked
+    return check
 
 
 positive = number("a positive number", lambda value: 0 < value < math.inf)

@@ -33,7 +33,7 @@ from sq_msgs_py import answers, poses
 from sq_msgs_py import grasps as messages
 from sq_msgs_py.answers import grasp_array
 from sq_msgs_py.markers import markers
-from sq_msgs_py.message_types import installed
+from sq_msgs_py.message_types import find_type
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.grasping.gripper import GRIPPERS, Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
@@ -113,7 +113,7 @@ class GraspNode(ManagedNode):
         self.create_service(Trigger, "~/plan", self._on_plan)
         optional(self, self.create_service, "sq_msgs/srv/PlanGrasps", "~/plan_array", self._on_plan_array)
         with suppress(ImportError):
-            self.create_service(installed("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
+            self.create_service(find_type("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.start(self._settings.current.autostart)
 

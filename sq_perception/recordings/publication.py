@@ -26,7 +26,7 @@ from sq_msgs_py.depth_image import (
 )
 from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.markers import Mesh as MarkerMesh
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
 from sq_perception.fitting.fit import Status
 from sq_perception.fitting.quality import undetermined
@@ -166,7 +166,7 @@ class Findings:
             parts=poses.move(self.parts, rotation, translation),
         )
 
-    def markers(self, alpha: float = ALPHA, types: MessageTypes = installed) -> Any:
+    def markers(self, alpha: float = ALPHA, types: MessageTypes = find_type) -> Any:
         """Return a MarkerArray of the bodies that did not fail, or their parts, with colours of this opacity by id."""
         shown, surfaces = self.array.recovered, []
         for k, mesh in enumerate(self.meshes):
@@ -272,7 +272,7 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     )
 
 
-def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = installed) -> Any:
+def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = find_type) -> Any:
     """Return an Image of depth (height, width) in metres, NaN or inf for nothing; mono8 and mono16: of the cube."""
     if encoding in _GREY_TYPES:
         return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
