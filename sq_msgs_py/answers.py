@@ -22,7 +22,7 @@ import numpy as np
 
 from sq_msgs_py.columns import UINT32, MessageError
 from sq_msgs_py.grasps import GraspArray
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.poses import poses_at
 from sq_msgs_py.superquadrics import FIELDS, SuperquadricArray
 
@@ -117,7 +117,7 @@ _AS_THEY_ARE = ("id", "label", "status", "reason", "seen", "part", "score", "res
 
 def superquadric_array(
     bodies: SuperquadricArray, covariances: np.ndarray, header: Any, parts: SuperquadricArray,
-    types: MessageTypes = installed,
+    types: MessageTypes = find_type,
 ) -> Any:
     """Return the sq_msgs/SuperquadricArray of bodies (n,), covariances (n, 6, 6) of their poses, and their parts.
 
@@ -130,7 +130,7 @@ def superquadric_array(
     )
 
 
-def grasp_array(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> Any:
+def grasp_array(grasps: GraspArray, header: Any, types: MessageTypes = find_type) -> Any:
     """Return the sq_msgs/GraspArray of grasps.  Raises ImportError as :func:`superquadric_array` does."""
     kind = types("sq_msgs/msg/Grasp")
     found = [

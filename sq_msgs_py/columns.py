@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from sq_msgs_py.depth_image import byte_array
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import PointCloud2
@@ -74,7 +74,7 @@ class Columns:
 Rows = TypeVar("Rows", bound=Columns)
 
 
-def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> PointCloud2:
+def to_message(rows: Columns, header: Any, types: MessageTypes = find_type) -> PointCloud2:
     """Return the message of n rows (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
     layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in rows.FIELDS])
     points = np.zeros(len(rows), layout)

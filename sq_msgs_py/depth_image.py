@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import CameraInfo, Image
@@ -43,7 +43,7 @@ class ImageError(ValueError):
 
 
 def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYPES)) -> np.ndarray:
-    """The pixels (height, width) of a single-channel image as they lie in the message: a view, nothing is copied.
+    """Return the pixels (height, width) of a single-channel image as they lie in the message: a view, no copy.
 
     Rows may be padded (``step``) and bytes may be swapped (``is_bigendian``); the array's strides and dtype follow.
     Raises ImageError if the encoding is none of ``encodings``, the image is empty, the step is shorter than a row, or
@@ -85,7 +85,7 @@ def labels_from_message(message: Image) -> np.ndarray:
     return np.maximum(labels, 0, out=labels)
 
 
-def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", types: MessageTypes = installed) -> Image:
+def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", types: MessageTypes = find_type) -> Image:
     """Return an image message of depth (height, width) in metres.
 
     32FC1 holds the values as they are.  16UC1 holds the nearest millimetre; what is not finite, below half a
@@ -104,7 +104,7 @@ def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", ty
     raise ImageError(f"encoding: expected {' or '.join(DEPTH_ENCODINGS)}, got {encoding!r}")
 
 
-def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = installed) -> Image:
+def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = find_type) -> Image:
     """Return a mono8 or mono16 message of uint8 or uint16 grey values (height, width).
 
     Raises ImageError for another dtype or not two dimensions.
@@ -117,7 +117,7 @@ def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = install
 
 
 def labels_to_message(
-    labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = installed
+    labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = find_type
 ) -> Image:
     """Return a label image message of integer labels (height, width).
 
@@ -163,7 +163,7 @@ class RawIntrinsics:
 
 
 def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
-    """Intrinsics of the rectified image that travels with a camera_info; region of interest and binning are applied.
+    """Return intrinsics of the rectified image of a camera_info; region of interest and binning are applied.
 
     The projection matrix P counts, and K where P is not set; both describe the full resolution.  For an image that is
     not rectified see :func:`raw_intrinsics_from_message`.  Raises ImageError if the camera is not calibrated (K and P
@@ -176,7 +176,7 @@ def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
 
 
 def raw_intrinsics_from_message(message: CameraInfo) -> RawIntrinsics:
-    """K and distortion of the raw image that travels with a camera_info; region of interest and binning are applied.
+    """Return K and distortion of the raw image of a camera_info; region of interest and binning are applied.
 
     K describes the full resolution.  Distortion acts on rays before they become pixels, so that a part of the image or
     binned pixels have the same.  Raises ImageError if the camera is not calibrated (K zero or not finite), the image
@@ -232,7 +232,7 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
     )
 
 
-def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = installed) -> CameraInfo:
+def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = find_type) -> CameraInfo:
     """Return a camera_info without distortion: K, R = I and P of the intrinsics."""
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     return types("sensor_msgs/msg/CameraInfo")(
@@ -248,7 +248,7 @@ def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTyp
 
 
 def byte_array(pixels: np.ndarray) -> array.array[int]:
-    """The bytes of an array as array.array('B'), the one type that message setters take over without looking at it."""
+    """Return an array's bytes as array.array('B'), the one type that message setters take over without a look."""
     data = array.array("B")
     data.frombytes(np.ascontiguousarray(pixels).reshape(-1).view(np.uint8).data)
     return data

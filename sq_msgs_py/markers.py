@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 
 if TYPE_CHECKING:
     from visualization_msgs.msg import MarkerArray
@@ -45,7 +45,7 @@ ALPHA = 0.7
 
 def markers(
     meshes: Sequence[Mesh], ids: Sequence[int], header: Any, *, colours: np.ndarray | None = None, alpha: float = ALPHA,
-    namespace: str = "superquadrics", types: MessageTypes = installed,
+    namespace: str = "superquadrics", types: MessageTypes = find_type,
 ) -> MarkerArray:
     """Return markers of n bodies, which replace all earlier ones.
 
@@ -80,7 +80,7 @@ def markers(
     black = np.array([0.05, 0.05, 0.05, 1.0])
     found = [make_marker(header=header, action=_DELETE_ALL)]
     for number, (surface_vertices, surface_faces, outline), colour in zip(ids, meshes, paint, strict=True):
-        vertices, faces = checked_mesh(surface_vertices, surface_faces)
+        vertices, faces = check_mesh(surface_vertices, surface_faces)
         corners = [point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
         found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
@@ -92,7 +92,7 @@ def markers(
     return types("visualization_msgs/msg/MarkerArray")(markers=found)
 
 
-def checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def check_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (k, 3), float64, and faces (m, 3) of their indices; ValueError for anything else."""
     vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:

@@ -17,7 +17,7 @@ from typing import Any
 MessageTypes = Callable[[str], Callable[..., Any]]
 
 
-def installed(name: str) -> Callable[..., Any]:
+def find_type(name: str) -> Callable[..., Any]:
     """Return the class of ``package/msg/Name`` from the message packages of a ROS installation.
 
     Raises ImportError where that package is not installed.

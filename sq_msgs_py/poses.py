@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.superquadrics import FAILED, SuperquadricArray
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def pose_messages(superquadrics: SuperquadricArray) -> list[Pose]:
     return poses_at(superquadrics.translation, unit_quaternions(superquadrics.rotation))
 
 
-def poses_at(places: np.ndarray, turns: np.ndarray, types: MessageTypes = installed) -> list[Pose]:
+def poses_at(places: np.ndarray, turns: np.ndarray, types: MessageTypes = find_type) -> list[Pose]:
     """Return poses at places (n, 3), turned by unit quaternions (n, 4)."""
     pose, point, quaternion = (types(f"geometry_msgs/msg/{name}") for name in ("Pose", "Point", "Quaternion"))
     return [

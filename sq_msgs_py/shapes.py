@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sq_msgs_py.markers import checked_mesh
+from sq_msgs_py.markers import check_mesh
 from sq_msgs_py.superquadrics import SuperquadricArray
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def enclosing_solids(size: np.ndarray, shape: np.ndarray) -> list[tuple[float, P
     ``size`` (3,): half sizes, metres.  ``shape`` (2,): e1, e2.  Raises ValueError if a half size is not positive or an
     exponent not in (0, 2].
     """
-    (a1, a2, a3), (e1, e2) = (known.tolist() for known in _checked(size, shape))
+    (a1, a2, a3), (e1, e2) = (known.tolist() for known in _check(size, shape))
     radius = sqrt(_largest(a1**2, a2**2, e2))
     outer = sqrt(_largest(radius**2, a3**2, e1))
     return [
@@ -92,7 +92,7 @@ def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
     from geometry_msgs.msg import Point
     from shape_msgs.msg import Mesh, MeshTriangle
 
-    vertices, faces = _checked_mesh(vertices, faces)
+    vertices, faces = _check_mesh(vertices, faces)
     return Mesh(
         vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()],
         triangles=[MeshTriangle(vertex_indices=corners) for corners in faces.astype(np.uint32)],
@@ -113,8 +113,8 @@ def enclosing_factor(
     ``shape``, ``taper``: (3,), (2,) and (2,) of the body, as in a message.  Raises ValueError if the mesh is not around
     the origin with its faces outwards, or the body is none.
     """
-    size, shape = _checked(size, shape)
-    vertices, faces = _checked_mesh(vertices, faces)
+    size, shape = _check(size, shape)
+    vertices, faces = _check_mesh(vertices, faces)
     corners = (vertices / size)[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normals, axis=1)
@@ -131,7 +131,7 @@ def enclosing_factor(
 def support(
     normals: np.ndarray, size: np.ndarray, shape: np.ndarray, taper: np.ndarray | tuple[float, float] = (0.0, 0.0)
 ) -> np.ndarray:
-    """How far a body reaches from its centre along directions (k, 3) of its own frame: (k,), times their lengths."""
+    """Return how far a body reaches from its centre along directions (k, 3) of its own frame, times their lengths."""
     if np.any(taper):
         return _of_sections(normals * size, (float(shape[0]), float(shape[1])), np.asarray(taper, dtype=float))
     x, y, z = np.abs(normals * size).T
@@ -166,7 +166,7 @@ def _dual(u: np.ndarray, v: np.ndarray, e: float) -> np.ndarray:
     return larger * (1 + ratio ** (2 / (2 - e))) ** ((2 - e) / 2)
 
 
-def _checked(size: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _check(size: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     size, shape = np.asarray(size, dtype=float), np.asarray(shape, dtype=float)
     if size.shape != (3,) or not (np.isfinite(size) & (size > 0)).all():
         raise ValueError(f"size: expected three half sizes above 0, got {size.tolist()}")
@@ -175,8 +175,8 @@ def _checked(size: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return size, shape
 
 
-def _checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    vertices, faces = checked_mesh(vertices, faces)
+def _check_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = check_mesh(vertices, faces)
     if not np.isfinite(vertices).all():
         raise ValueError("mesh: expected finite vertices")
     return vertices, faces

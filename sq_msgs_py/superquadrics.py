@@ -52,7 +52,7 @@ import numpy as np
 from sq_msgs_py import columns
 from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
 from sq_msgs_py.columns import MessageError as MessageError
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import PointCloud2
@@ -157,8 +157,8 @@ class SuperquadricArray(Columns):
         return cls(**{each.name: np.empty(0, np.uint32) for each in fields(cls)})
 
 
-def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
-    """The message of n superquadrics (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
+def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageTypes = find_type) -> PointCloud2:
+    """Return the message of n superquadrics (n may be 0) with this std_msgs/Header, of the classes in ``types``."""
     return columns.to_message(superquadrics, header, types)
 
 

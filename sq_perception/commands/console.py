@@ -85,7 +85,7 @@ def with_negatives(arguments: Sequence[str]) -> list[str]:
 def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
     """Return the argument type of a whole number from ``least`` to ``most``, or without an upper bound."""
 
-    def checked(text: str) -> int:
+    def check(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
@@ -96,13 +96,13 @@ def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(f"expected {least} to {most}, got {value}")
         return value
 
-    return checked
+    return check
 
 
 def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float]:
     """Return the argument type of a number for which ``holds`` is true; ``wanted`` names it in complaints."""
 
-    def checked(text: str) -> float:
+    def check(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
@@ -111,7 +111,7 @@ def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float
             raise argparse.ArgumentTypeError(f"expected {wanted}, got {text}")
         return value
 
-    return checked
+    return check
 
 
 positive = number("a positive number", lambda value: 0 < value < math.inf)
@@ -144,6 +144,16 @@ def folder(text: str) -> Path:
     except OSError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return Path(text)
+
+
+def write_document(option: str, path: str, text: str, is_whole: bool = True) -> str:
+    """Write a document to a file or, for -, to the standard output; return where else it is, if it is unfinished."""
+    if path == STANDARD_OUTPUT:
+        sys.stdout.write(text)
+        return ""
+    # Names of files need not be UTF-8.
+    written = output_file.write(path, text.encode(errors="backslashreplace"), is_whole)
+    return "" if written == Path(path) else f"--{option}: unfinished, so {path} stays as it is: see {written}"
 
 
 def replaced_input(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from sq_perception.commands.console import (
     positive,
     reject_usage,
     text_target,
+    write_document,
 )
 
 FORMAT, VERSION = "sq_perception.points", 1
@@ -56,7 +56,6 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from sq_perception.files import output_file
     from sq_perception.files.unpacking import UnpackingError
     from sq_perception.recordings.cloud_file import read_surface
 
@@ -77,10 +76,10 @@ def _run(options: argparse.Namespace) -> int:
                 print(f"  {number} {_line(body)}")
     if options.json:
         text = json.dumps({"format": FORMAT, "version": VERSION, "files": entries}, indent=1, allow_nan=False) + "\n"
-        if options.json == STANDARD_OUTPUT:
-            sys.stdout.write(text)
-        elif entries:
-            output_file.write(options.json, text.encode(), code == SUCCESS)
+        if (entries or options.json == STANDARD_OUTPUT) and (
+            problem := write_document("json", options.json, text, code == SUCCESS)
+        ):
+            complain(problem)
     return code
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -55,15 +54,13 @@ def run(options: argparse.Namespace) -> int:
         code, is_whole = _plan_all(recorded, Recoverer(), hand, friction, options, entries)
         chosen = {"gripper": hand.name, "friction": friction}
         document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
-        text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist)
-        if options.json == STANDARD_OUTPUT:
-            sys.stdout.write(f"{text}\n")
-            return code
-        if options.json and entries:
-            written = output_file.write(options.json, f"{text}\n".encode(), is_whole)
-            if written != Path(options.json):
-                complain(f"--json: unfinished, so {options.json} stays as it is: see {written}")
-        _print_table(entries)
+        text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist) + "\n"
+        is_printed = options.json == STANDARD_OUTPUT
+        is_wanted = is_printed or (options.json and entries)
+        if is_wanted and (problem := console.write_document("json", options.json, text, is_whole)):
+            complain(problem)
+        if not is_printed:
+            _print_table(entries)
         return code
     except (FrameError, CheckpointError, OSError) as error:
         return fail(str(error))

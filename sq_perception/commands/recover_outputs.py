@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -131,8 +130,9 @@ class Outputs:
             self._lines.close()
         for name, output in (("mcap", self._bag), ("html", self._page)):
             try:
-                if output is not None and (found := output.close(whole)) is not None:
-                    yield from _elsewhere(name, Path(getattr(self._options, name)), found)
+                path = getattr(self._options, name)
+                if output is not None and (found := output.close(whole)) is not None and found != path:
+                    yield f"--{name}: unfinished, so {path} stays as it is: see {found}"
             except OSError as error:
                 yield f"--{name}: {error}"
         if self._not_in_bag:
@@ -142,18 +142,14 @@ class Outputs:
             ("json", lambda: result_json.document(_decisive(self._options), entries, self.scene)),
             ("csv", lambda: result_json.table(entries)),
         ):
-            if getattr(self._options, name) == console.STANDARD_OUTPUT:
-                sys.stdout.write(text())
-            elif getattr(self._options, name):
-                path = Path(getattr(self._options, name))
-                try:
-                    if not entries and path.is_file() and path.stat().st_size:
-                        yield f"--{name}: no frame was read, so {path} stays as it is"
-                    else:
-                        data = text().encode(errors="backslashreplace")  # a file's name may be no UTF-8
-                        yield from _elsewhere(name, path, output_file.write(path, data, whole))
-                except OSError as error:
-                    yield f"--{name}: {error}"
+            path = getattr(self._options, name)
+            try:
+                if path and not entries and Path(path).is_file() and Path(path).stat().st_size:
+                    yield f"--{name}: no frame was read, so {path} stays as it is"
+                elif path and (problem := console.write_document(name, path, text(), whole)):
+                    yield problem
+            except OSError as error:
+                yield f"--{name}: {error}"
 
 
 def _stem(entry: Mapping[str, Any]) -> str:
@@ -184,11 +180,6 @@ def _bag(options: argparse.Namespace) -> ResultBag | None:
         return ResultBag(options.mcap, [] if images == ["none"] else images)
     except (ValueError, ImportError) as error:
         raise type(error)(f"--mcap: {error}") from error
-
-
-def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:
-    if found != path:
-        yield f"--{name}: unfinished, so {path} stays as it is: see {found}"
 
 
 def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

@@ -33,7 +33,7 @@ class OutputFile:
         else:
             self._target = Path(os.path.realpath(self.path))
             self.partial = self._target.with_name(f"{self._target.stem}.partial{self._target.suffix}")
-            self._descriptor = open_locked(self.partial)
+            self._descriptor = open_locked(self.partial, os.O_NOFOLLOW)
             os.ftruncate(self._descriptor, 0)
 
     def __enter__(self) -> OutputFile:
@@ -132,9 +132,9 @@ def free_name(name: str, taken: set[str]) -> str:
     return free
 
 
-def open_locked(path: Path) -> int:
+def open_locked(path: Path, flags: int = 0) -> int:
     """Open a file for reading and writing, made if need be; OSError if another program has it open."""
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | flags, 0o666)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

@@ -229,7 +229,7 @@ class FrameNode(ManagedNode):
         self._poses.follow(stamp_of(arrival.message))
         view: tuple[str, CameraPose] | None = None
         if parameters.camera_frame:
-            view = parameters.camera_frame, self._found_pose(arrival.message.header, parameters, "camera_frame")
+            view = parameters.camera_frame, self._find_pose(arrival.message.header, parameters, "camera_frame")
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters, view)
         answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
@@ -245,10 +245,10 @@ class FrameNode(ManagedNode):
             return unit_cube.POSE
         if not parameters.target_frame or parameters.box is None:
             return None
-        turn, shift = self._found_pose(frame.header, parameters, "target_frame")
+        turn, shift = self._find_pose(frame.header, parameters, "target_frame")
         return tuple(turn.tolist()), tuple(shift.tolist())
 
-    def _found_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
+    def _find_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
         """Return the pose of a header's frame in that of the parameter ``name``; ValueError if it is unknown.
 
         A transform that has not come yet is waited for while other cameras compute.
@@ -266,7 +266,7 @@ class FrameNode(ManagedNode):
         with timed(stages, "tracking"):
             found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
-            shown = self._outputs.shown_bodies(found, frame, parameters)
+            shown = self._outputs.make_findings(found, frame, parameters)
             # Both may have waited for transforms.  Disabled meanwhile: least of all a grasped body is published.
             if not self._is_wanted():
                 return None

@@ -35,7 +35,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from rclpy.node import Node
 from rclpy.task import Future
 
-from sq_msgs_py.message_types import installed
+from sq_msgs_py.message_types import find_type
 
 _NAMES = {
     Transition.TRANSITION_CONFIGURE: "configure",
@@ -57,7 +57,7 @@ _END = 4.0
 def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any, **more: Any) -> Any:
     """Return what ``create`` makes of an interface package/msg/Name of sq_msgs; None if it is not installed."""
     try:
-        return create(installed(name), *arguments, **more)
+        return create(find_type(name), *arguments, **more)
     except ModuleNotFoundError:
         return None
     except Exception as error:  # a package that is there in part fails in other ways

@@ -33,7 +33,7 @@ from visualization_msgs.msg import MarkerArray
 from sq_msgs_py import collision_objects
 from sq_msgs_py.answers import superquadric_array
 from sq_msgs_py.markers import markers
-from sq_msgs_py.message_types import installed
+from sq_msgs_py.message_types import find_type
 from sq_msgs_py.poses import detections, plane_message, transforms
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.nodes.frame import Frame, latched_qos
@@ -90,7 +90,7 @@ class Outputs:
             header, self._header = self._header, None
             self.markers.publish(markers([], [], header))
 
-    def shown_bodies(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
+    def make_findings(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """Return the findings as every output shows them: in ``target_frame`` if there is one.
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
@@ -238,7 +238,7 @@ class OptionalOutputs:
     def _create(self, parameter: str) -> None:
         package, kind, topic, queue = _KINDS[parameter]
         try:
-            message_type: Any = installed(f"{package}/msg/{kind}")
+            message_type: Any = find_type(f"{package}/msg/{kind}")
             events = PublisherEventCallbacks(matched=partial(self._note_listener, parameter))
             self._publishers[parameter] = self._node.create_publisher(
                 message_type, topic, queue, event_callbacks=events

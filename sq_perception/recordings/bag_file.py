@@ -138,7 +138,7 @@ class RecordedBag:
         self._opened.close()
 
     def __len__(self) -> int:
-        """Return images that will be read, as the bag counts them; a damaged bag may count wrong."""
+        """Return how many images will be read, as the bag counts them; a damaged bag may count wrong."""
         count = sum(
             max(0, connection.msgcount) for connection in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
         )
@@ -228,14 +228,14 @@ class RecordedBag:
 
     # frames
 
-    def _recorded_masks(self, received: int | None = None) -> Iterator[Message | FrameError]:
+    def _read_masks(self, received: int | None = None) -> Iterator[Message | FrameError]:
         connections = self._mask_reader.connections(IMAGE, topic=self._mask_topics[0])
         return self._mask_reader.messages(connections, received=received)
 
     def _index_masks(self) -> None:
         """Note when each mask was recorded: a segmentation may answer its images in another order."""
         try:
-            for message in self._recorded_masks():
+            for message in self._read_masks():
                 if isinstance(message, FrameError):
                     self._unread = self._unread or message
                     continue
@@ -251,7 +251,7 @@ class RecordedBag:
         if stamp == Stamp(0, 0):
             return None
         if stamp in self._mask_times:
-            found = self._recorded_masks(self._mask_times[stamp])
+            found = self._read_masks(self._mask_times[stamp])
             return next(one for one in found if isinstance(one, Message) and one.stamp == stamp)
         if self._unread is not None:
             raise ValueError(f"it has no mask, or one that cannot be read: {self._unread}")

@@ -120,7 +120,7 @@ class BagReader:
     def messages(
         self, connections: list[Any], every: int = 1, limit: int | None = None, received: int | None = None
     ) -> Iterator[Message | FrameError]:
-        """Return messages in the order they were recorded; of images every n-th, at most ``limit``.
+        """Yield messages in the order they were recorded; of images every n-th, at most ``limit``.
 
         ``received``: only those of this time, nanoseconds.
         """

@@ -157,7 +157,7 @@ def read_camera_info(source: str | Path, size: tuple[int, int] | None = None, na
 
 
 def camera_beside(path: Path) -> Path | None:
-    """The camera of an image: a file of its folder, of its name, or, of a folder of depth images, in the one above."""
+    """Find the camera of an image: a file of its folder, of its name, or, of a folder of depth images, above it."""
     beside = path.with_suffix(".yaml")  # as sq-perception render writes it
     if found := camera_in(path.parent) or (beside if beside.is_file() else None):
         return found
@@ -224,7 +224,7 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
 
 
 def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None) -> Iterator[_Found]:
-    """Return everything in a document that has a field of a camera."""
+    """Yield everything in a document that has a field of a camera."""
     left = [10_000] if left is None else left  # a scene of BOP has 3 for each of a thousand images
     left[0] -= 1
     if left[0] < 0:

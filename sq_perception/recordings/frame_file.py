@@ -63,29 +63,14 @@ class Stamp(NamedTuple):
 class RecordedFrame:
     """One depth image with its camera.
 
-    Attributes
-    ----------
-    depth : float32 (height, width)
-        Metres in the optical frame, NaN where nothing was measured.
-    camera : Camera
-    labels : int32 (height, width) or None
-        Instance masks, 0 for background.
-    name : str
-        The file's name; of a frame in a bag, the bag's and the stamp.
-    stamp : Stamp or None
-        When it was taken, where the recording knows.
-    topic, frame_id : str
-        Where it was published, and the name of its optical frame; empty for files.
-    warning : str
-        What should be known about the frame before its results are believed; empty if nothing.
-    notes : str
-        What was found out about its numbers: units, marks of nothing measured; likewise.
-    encoding : str
-        Of the depth where it came from, as messages name it (16UC1, 32FC1, mono8, mono16); empty where it has none.
-    received : int or None
-        When a bag received it, nanoseconds.
-    has_free_space : bool
-        Whether a pixel beside an object shows that there is nothing before what it measured.
+    ``depth``: metres in the optical frame, NaN where nothing was measured.  ``labels`` int32 (height,
+    width) or None: instance masks, 0 for background.  ``name``: the file's name; of a frame in a bag, the bag's and the
+    stamp.  ``stamp`` Stamp or None: when it was taken, where the recording knows.  ``topic``, ``frame_id``: where it
+    was published, and the name of its optical frame; empty for files.  ``warning``: what should be known about the
+    frame before its results are believed; empty if nothing.  ``notes``: what was found out about its numbers: units,
+    marks of nothing measured; likewise.  ``encoding``: of the depth where it came from, as messages name it (16UC1,
+    32FC1, mono8, mono16); empty where it has none.  ``received`` int or None: when a bag received it, nanoseconds.
+    ``has_free_space``: whether a pixel beside an object shows that there is nothing before what it measured.
     """
 
     depth: np.ndarray
@@ -142,7 +127,7 @@ class Reading:
             raise ValueError(f"region: expected left, top >= 0 and width, height >= 1, got {self.region}")
 
     def z(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Depth along the optical axis of a rectified image of this kind.  ValueError where a cloud was announced."""
+        """Return depth along the optical axis of a rectified image of this kind; ValueError for an announced cloud."""
         if self.frame is not None:
             raise ValueError("frame: expected a cloud, got a depth image, which is in the frame of its camera")
         return depth_units.z_from_range(depth, camera) if self.kind == "range" else depth
@@ -195,20 +180,11 @@ def read(
 
     Raises FrameError for anything wrong with a file; ValueError for an unknown projection or treatment of distortion.
 
-    Parameters
-    ----------
-    path
-        See the table above.
-    camera_info
-        Intrinsics of an image: YAML as camera_calibration writes it or as a camera_info message prints, or another
-        form of :mod:`sq_perception.recordings.camera_file`; None: what lies beside the image.
-    projection
-        "pinhole" or "orthographic".
-    distortion
-        Of a PNG: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`; auto looks at the
-        names of the file and its folder.
-    reading
-        What is taken of the image; all of it by default.
+    ``path``: See the table above.  ``camera_info``: Intrinsics of an image: YAML as camera_calibration writes it or as
+    a camera_info message prints, or another form of :mod:`sq_perception.recordings.camera_file`; None: what lies beside
+    the image.  ``projection``: "pinhole" or "orthographic".  ``distortion``: of a PNG: "auto", "apply" or "ignore", see
+    :mod:`sq_perception.imaging.calibration`; auto looks at the names of the file and its folder.  ``reading``: what is
+    taken of the image; all of it by default.
     """
     if projection not in get_args(Projection):
         raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {projection!r}")

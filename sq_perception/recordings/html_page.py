@@ -101,7 +101,7 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> dict[str, Any]:
 
 
 def _body(number: int, body: Superquadric, sigma_size: np.ndarray, up: np.ndarray) -> dict[str, Any]:
-    """The parameters of a body, the half sizes of its shell where they are known, and how far up its label stands."""
+    """Return a body's parameters, the half sizes of its shell if they are known, and the height of its label."""
     sigma = np.nan_to_num(sigma_size, posinf=np.inf)
     outer = np.minimum(body.size + 2 * sigma, 3 * body.size)  # a shell that is hardly known would hide the rest
     return {

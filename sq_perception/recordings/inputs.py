@@ -41,7 +41,10 @@ _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 _log = logging.getLogger(__name__)
 ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
-_DIGITS = re.compile(r"(\d+)")
+INTERVAL = 0.1
+"""Seconds."""
+Pose = tuple[np.ndarray, np.ndarray]
+"""Quaternion x y z w (4,), translation (3,)."""
 
 
 class RecordedInput:
@@ -102,7 +105,7 @@ class RecordedInput:
         return found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
 
     def _in_folders(self, folder: Path, above: str | Path | None, levels: int = 4) -> list[_Source]:
-        """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
+        """List the frames of a folder, or of those in it, with their camera, which may be that of ``above``."""
         try:
             camera_info = self._options.camera_info or camera_in(folder) or above
             if found := in_folder(folder):
@@ -150,13 +153,9 @@ def in_folder(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
-    """Return numbers in a name count as numbers: every second part is one."""
-    parts = _DIGITS.split(path.name.lower())
+    """Return a key of natural order: every second part of a name is a number."""
+    parts = re.split(r"(\d+)", path.name.lower())
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
-
-
-Pose = tuple[np.ndarray, np.ndarray]
-"""Quaternion x y z w (4,), translation (3,)."""
 
 
 class CameraPoses:
@@ -200,12 +199,8 @@ def _key(name: str) -> str:
         return name
 
 
-INTERVAL = 0.1
-"""Seconds."""
-
-
 def sequence_of(file: str, frame: RecordedFrame) -> tuple[str, str]:
-    """A key that the frames of one sequence share: their bag and topic, or their folder; ``file`` is the source."""
+    """Return a key that the frames of one sequence share: their bag and topic, or the folder of the source."""
     return (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
 
 

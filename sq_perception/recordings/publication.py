@@ -26,7 +26,7 @@ from sq_msgs_py.depth_image import (
 )
 from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.markers import Mesh as MarkerMesh
-from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
 from sq_perception.fitting.fit import Status
 from sq_perception.fitting.quality import undetermined
@@ -68,7 +68,7 @@ class Identified:
     columns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     def summary(self, is_cube: bool) -> str:
-        """One frame's results in a line: ids, status words and full edges, of the unit cube or in millimetres."""
+        """Return the results in a line: ids, status words and full edges, of the unit cube or in millimetres."""
         recovery = self.recovery
         remark = f": {recovery.message}" if recovery.message else ""
         took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms{remark}"
@@ -166,7 +166,7 @@ class Findings:
             parts=poses.move(self.parts, rotation, translation),
         )
 
-    def markers(self, alpha: float = ALPHA, types: MessageTypes = installed) -> Any:
+    def markers(self, alpha: float = ALPHA, types: MessageTypes = find_type) -> Any:
         """Return a MarkerArray of the bodies that did not fail, or their parts, with colours of this opacity by id."""
         shown, surfaces = self.array.recovered, []
         for k, mesh in enumerate(self.meshes):
@@ -272,7 +272,7 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     )
 
 
-def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = installed) -> Any:
+def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = find_type) -> Any:
     """Return an Image of depth (height, width) in metres, NaN or inf for nothing; mono8 and mono16: of the cube."""
     if encoding in _GREY_TYPES:
         return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
@@ -282,7 +282,7 @@ def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageT
 def depth_of(
     message: Any, is_cube: bool, scale: float | None = None, known: Stated | None = None
 ) -> tuple[Metres, str]:
-    """Return depth of an image message, and its encoding before it was packed.
+    """Return the depth of an image message, and its encoding before it was packed.
 
     ``message``: sensor_msgs/Image of 16UC1 or 32FC1, or CompressedImage of the compressedDepth transport; if
     ``is_cube`` Image of mono8 or mono16, grey values of the unit cube.  ``scale``, ``known``: units, as

@@ -74,7 +74,7 @@ def inflate(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Sup
 
 
 def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = None, meshes: bool = False) -> list[Solid]:
-    """What encloses each of n bodies, in a format's kinds of solids; ``names`` are body_0, body_1 ... if not given.
+    """Return what encloses each of n bodies, in a format's kinds of solids; ``names``: body_0, body_1 ... by default.
 
     Raises ValueError for a format that is none, or names that are not one a body and different.
     """
@@ -106,14 +106,8 @@ def write(
 ) -> list[Path]:
     """Write n bodies (n,) as a scene; the files, those of meshes behind the scene's.  ValueError as :func:`solids`.
 
-    Parameters
-    ----------
-    form
-        urdf, sdf, mjcf or curobo.
-    frame
-        The link of a URDF that the bodies are fixed to.
-    meshes
-        Close meshes instead of the smallest enclosing solids.
+    ``form``: urdf, sdf, mjcf or curobo.  ``frame``: the link of a URDF that the bodies are fixed to.  ``meshes``: close
+    meshes instead of the smallest enclosing solids.
     """
     import trimesh
 
@@ -135,7 +129,7 @@ def write(
 
 
 def _capsule(size: np.ndarray, shape: np.ndarray) -> list[tuple[float, Primitive]]:
-    """The capsule about a body's z axis with the radius of its cylinder, and its volume; none for a flat body."""
+    """Return the capsule about a body's z axis with its cylinder's radius, and its volume; none if it is flat."""
     (radius,) = (one.dimensions[1] for _, one in enclosing_solids(size, shape) if one.kind == CYLINDER)
     angle = np.linspace(0.0, np.pi / 2, 1001)[1:]  # from the equator to the pole
     normals = np.stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)], axis=1)

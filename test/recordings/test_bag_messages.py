@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from sq_msgs_py import columns, depth_image, superquadrics
 from sq_msgs_py.depth_image import Intrinsics
 from sq_msgs_py.markers import markers
-from sq_msgs_py.message_types import installed
+from sq_msgs_py.message_types import find_type
 from sq_msgs_py.superquadrics import FIELDS, SuperquadricArray
 from sq_perception.geometry.mesh import mesh, outline
 from sq_perception.geometry.superquadric import Superquadric
@@ -59,7 +59,7 @@ def test_the_bytes_are_those_that_rclpy_makes(kind):
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     from rclpy.serialization import deserialize_message, serialize_message
 
-    live, recorded = make(kind, installed), make(kind, result_bag.types)
+    live, recorded = make(kind, find_type), make(kind, result_bag.types)
     data, reference = result_bag.as_cdr(recorded), serialize_message(live)
     assert len(data) == len(reference)
     assert data == TYPES.serialize_cdr(TYPES.deserialize_cdr(reference, recorded.__msgtype__), recorded.__msgtype__)
