@@ -21,6 +21,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
+from sq_msgs_py.poses import prefix_in
 from sq_perception.nodes import process
 
 ARGUMENTS = {
@@ -103,7 +104,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
         nodes.append(_node("fitter_node", given, classic, inputs, name="fitter_node", **single))
     if asked["grasp"]:
         wiring = [(name, f"recover_node/{name}") for name in ("superquadrics", "support_plane")]
-        own = files + [switches] * bool(switches)
+        # First, so that a prefix in the file has the last word.
+        own = [{"tf_prefix": prefix_in(first)}] * bool(cameras) + files + [switches] * bool(switches)
         own += [{"gripper": given["gripper"]}] * bool(given["gripper"])
         nodes.append(_node("grasp_node", given, own, wiring, name="grasp_node", **single))
     return [*nodes, _rviz(given, first)] if asked["rviz"] else nodes

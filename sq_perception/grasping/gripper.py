@@ -51,6 +51,8 @@ class Gripper:
         The link of the gripper's model that the pose of the TCP is given in.
     link_from_tcp : (3,), (4,)
         Position and quaternion x y z w of the TCP in that link: p_link = R p_tcp + t.
+    joints
+        The fingers' joints in that model, each of which moves by half of the opening; none where fingers turn.
 
     Raises
     ------
@@ -69,11 +71,12 @@ class Gripper:
     force: float
     link: str
     link_from_tcp: tuple[tuple[float, float, float], tuple[float, float, float, float]]
+    joints: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for field in fields(self):
             value = getattr(self, field.name)
-            if field.name not in ("name", "link", "link_from_tcp"):
+            if field.name not in ("name", "link", "link_from_tcp", "joints"):
                 count = (3,) if field.name == "hand" else ()
                 if not (_are_numbers(value, count) and np.greater(value, 0).all()):
                     expected = "three positive numbers" if count else "a positive number"
@@ -149,8 +152,9 @@ PANDA = Gripper(
     force=70.0,
     link="panda_hand",
     link_from_tcp=((0.0, 0.0, 0.1034), (0.0, 0.0, 0.0, 1.0)),
+    joints=("panda_finger_joint1", "panda_finger_joint2"),
 )
-"""Franka Hand.  Opening 80 mm, 70 N without end: its data sheet.  Boxes of pads and hand, TCP:
+"""Franka Hand.  Opening 80 mm, 70 N without end: its data sheet.  Boxes of pads and hand, TCP, joints:
 franka_description."""
 
 ROBOTIQ_2F_85 = Gripper(

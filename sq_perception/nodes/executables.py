@@ -38,7 +38,7 @@ Superquadrics in, grasps of a parallel gripper out.
 
 subscribes superquadrics and support_plane: remap them to /recover_node/superquadrics, /recover_node/support_plane
 publishes  ~/grasps ~/grasp_details ~/markers /diagnostics
-services   ~/plan, and those of a lifecycle node
+services   ~/plan, ~/plan_grasps where moveit_msgs is installed, and those of a lifecycle node
 with the package sq_msgs also ~/grasp_array ~/plan_array""",
     "synthetic_depth_node": """\
 A simulated depth camera, or recorded frames.

@@ -5,13 +5,17 @@ frame since; without a plane, grippers approach from the side of the frame's ori
 Measured points, unseen space and correlations are in no message and so ignored, unlike in ``sq-perception grasp``.  The
 cloud does not say whether it is in metres: of clouds from orthographic images, only the frame ``unit_cube`` is refused.
 
-``~/plan`` plans on the last cloud again, unless it is older than ``max_age``: if the camera has
+``~/plan`` and ``~/plan_grasps`` plan on the last cloud again, unless it is older than ``max_age``: if the camera has
 stopped, the bodies may be gone.
+
+If moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp for the body whose
+collision object is the target's id, or for all bodies without an id.  Other fields of the request are ignored.
 """
 
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic
 from typing import Any, cast
@@ -29,6 +33,7 @@ from sq_msgs_py import answers, poses
 from sq_msgs_py import grasps as messages
 from sq_msgs_py.answers import grasp_array
 from sq_msgs_py.markers import markers
+from sq_msgs_py.message_types import find_type
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.grasping.gripper import GRIPPERS, Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
@@ -38,7 +43,7 @@ from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.managed_node import ManagedNode, optional
 from sq_perception.nodes.outputs import ARRIVAL
-from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, setting
+from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, check_prefix, setting
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
 from sq_perception.recovery.recovery import timed
@@ -54,11 +59,12 @@ class GraspParameters(Parameters):
 
     autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     max_age: float = setting(
-        10.0, "~/plan refuses bodies older than this; 0: never.", unit="s", within=(0.0, 3600.0)
+        10.0, "~/plan and ~/plan_grasps refuse bodies older than this; 0: never.", unit="s", within=(0.0, 3600.0)
     )
     no_cloud_warning: float = setting(
         5.0, "Warn after this time without bodies; 0 never warns.", unit="s", within=(0.0, 3600.0)
     )
+    tf_prefix: str = setting(poses.PREFIX, "The tf_prefix of recover_node, for the names that ~/plan_grasps uses.")
     gripper: str = setting("panda", "Gripper to plan for.", choices=tuple(GRIPPERS))
     friction: float = setting(FRICTION, "Smallest friction coefficient between pads and objects.", within=(0.05, 2.0))
     placement: float = setting(
@@ -81,6 +87,7 @@ class GraspParameters(Parameters):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_box("region", self.region)
+        check_prefix(self.tf_prefix)
 
 
 class GraspNode(ManagedNode):
@@ -105,6 +112,8 @@ class GraspNode(ManagedNode):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/plan", self._on_plan)
         optional(self, self.create_service, "sq_msgs/srv/PlanGrasps", "~/plan_array", self._on_plan_array)
+        with suppress(ImportError):
+            self.create_service(find_type("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.start(self._settings.current.autostart)
 
@@ -194,6 +203,28 @@ class GraspNode(ManagedNode):
         found, response.message = self._plan_again(cloud)
         if found and cloud:
             response.success, response.grasps = True, grasp_array(found, cloud.header)
+        return response
+
+    def _on_plan_grasps(self, request: Any, response: Any) -> Any:
+        code, target, cloud = response.error_code, request.target.id, self._last
+        code.source = self.get_fully_qualified_name()
+        found, code.message = self._plan_again(cloud)
+        if found is None or cloud is None:
+            code.val = code.FAILURE
+            return response
+        settings = self._settings.current
+        known = [poses.body_name(number, settings.tf_prefix) for number in from_message(cloud).recovered.id]
+        if target and target not in known:
+            code.val = code.INVALID_OBJECT_NAME
+            code.message = f"target: expected an id among {', '.join(known) or 'none'}, got {target!r}"
+            return response
+        hand, plane = gripper(settings.gripper), self._plane_in(cloud.header)
+        up = None if plane is None else plane[:3].tolist()
+        each = messages.moveit_grasps(
+            found, cloud.header, hand.link, hand.link_from_tcp, up, settings.tf_prefix, hand.joints
+        )
+        response.grasps = [one for one in each if not target or target in one.allowed_touch_objects]
+        code.val = code.SUCCESS if response.grasps else code.PLANNING_FAILED
         return response
 
     def _plan_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:

@@ -2,7 +2,8 @@
 
 Definitions: tf2_msgs of geometry2 (jazzy), vision_msgs 4.1.1, moveit_msgs (ros2) and object_recognition_msgs.  As in
 the classes that rosidl makes, an unknown field or a wrong type raises, and a ``byte`` is bytes of length 1.  Fields of
-the planning scene that nobody here touches (joints, colours, octomaps) are left out.
+the planning scene that nobody here touches (joints, colours, octomaps) are left out.  Services need what only a build
+has: a test that calls one skips where the package is not installed.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from importlib.util import find_spec
 from typing import Any
 
 import pytest
-from geometry_msgs.msg import Pose, PoseWithCovariance, Vector3
+from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovariance, Vector3, Vector3Stamped
 from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory
 
 
 def definition(name: str, constants: dict[str, Any] | None = None, /, **fields: Callable[[], Any]) -> type[Any]:
@@ -55,10 +57,25 @@ RobotState = definition("RobotState", attached_collision_objects=list, is_diff=b
 PlanningSceneWorld = definition("PlanningSceneWorld", collision_objects=list)
 PlanningScene = definition("PlanningScene", name=str, robot_state=RobotState, world=PlanningSceneWorld, is_diff=bool)
 
+GripperTranslation = definition(
+    "GripperTranslation", direction=Vector3Stamped, desired_distance=float, min_distance=float
+)
+Grasp = definition(
+    "Grasp", id=str, pre_grasp_posture=JointTrajectory, grasp_posture=JointTrajectory, grasp_pose=PoseStamped,
+    grasp_quality=float, pre_grasp_approach=GripperTranslation, post_grasp_retreat=GripperTranslation,
+    post_place_retreat=GripperTranslation, max_contact_force=float, allowed_touch_objects=list,
+)
+MoveItErrorCodes = definition(
+    "MoveItErrorCodes", {"SUCCESS": 1, "FAILURE": 99999, "PLANNING_FAILED": -1, "INVALID_OBJECT_NAME": -19}, val=int,
+    message=str, source=str,
+)
+
 PACKAGES = {
     "tf2_msgs": (TFMessage,),
     "vision_msgs": (ObjectHypothesis, ObjectHypothesisWithPose, BoundingBox3D, Detection3D, Detection3DArray),
-    "moveit_msgs": (CollisionObject, RobotState, PlanningSceneWorld, PlanningScene),
+    "moveit_msgs": (
+        CollisionObject, RobotState, PlanningSceneWorld, PlanningScene, GripperTranslation, Grasp, MoveItErrorCodes,
+    ),
 }
 
 

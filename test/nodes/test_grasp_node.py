@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import soft_messages
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
@@ -277,6 +279,62 @@ def test_what_was_there_before_a_pause_is_neither_shown_nor_planned_for_after_it
     assert bench.node._change("activate")
     answer = bench.call(Trigger, "/grasp_node/plan")
     assert (answer.success, answer.message) == (False, "no superquadrics have come yet")
+
+
+def asked_for(bench, target):
+    """What MoveIt's service answers: its handler, as classes of a service exist only where they are built."""
+    from moveit_msgs.msg import MoveItErrorCodes
+
+    response = SimpleNamespace(grasps=[], error_code=MoveItErrorCodes())
+    return bench.node._on_plan_grasps(SimpleNamespace(target=SimpleNamespace(id=target)), response)
+
+
+def test_moveit_asks_for_the_grasps_of_one_object(bench, monkeypatch):
+    soft_messages.install(monkeypatch)
+    early = asked_for(bench, "")
+    assert early.error_code.val == early.error_code.FAILURE
+    assert early.error_code.message == "no superquadrics have come yet"
+
+    details = messages.from_message(bench.answer(to_message(bodies(), HEADER))["grasp_details"])
+    every = asked_for(bench, "")
+    assert every.error_code.val == every.error_code.SUCCESS
+    assert every.error_code.source == "/grasp_node"
+    np.testing.assert_allclose([one.grasp_quality for one in every.grasps], details.score, atol=1e-6)
+    can = asked_for(bench, f"superquadric_{CAN}")
+    assert len(can.grasps) == (details.id == CAN).sum()
+    assert {tuple(one.allowed_touch_objects) for one in can.grasps} == {(f"superquadric_{CAN}",)}
+    first = can.grasps[0]
+    assert first.grasp_pose.header.frame_id == first.post_grasp_retreat.direction.header.frame_id == "base_link"
+    lift = first.post_grasp_retreat.direction.vector
+    np.testing.assert_allclose([lift.x, lift.y, lift.z], [0.0, 0.0, 1.0], atol=1e-12)
+    assert first.grasp_posture.joint_names == ["panda_finger_joint1", "panda_finger_joint2"]
+
+    wall = asked_for(bench, f"superquadric_{WALL}")
+    assert not wall.grasps
+    assert wall.error_code.val == wall.error_code.PLANNING_FAILED
+    assert f"{WALL}: wider than the opening" in wall.error_code.message
+    other = asked_for(bench, "table")
+    assert other.error_code.val == other.error_code.INVALID_OBJECT_NAME
+    assert "expected an id among superquadric_4, superquadric_7" in other.error_code.message
+
+
+def test_without_a_table_the_retreat_goes_back_as_it_came(bench, monkeypatch):
+    soft_messages.install(monkeypatch)
+    bench.answer(to_message(bodies(), Header(frame_id="elsewhere")))
+    for one in asked_for(bench, f"superquadric_{BOX}").grasps:
+        came, goes = one.pre_grasp_approach.direction, one.post_grasp_retreat.direction
+        assert came.header.frame_id == goes.header.frame_id == "panda_hand"
+        assert (came.vector.x, came.vector.y, came.vector.z) == (-goes.vector.x, -goes.vector.y, -goes.vector.z)
+
+
+def test_moveit_is_answered_over_the_wire(bench):
+    services = pytest.importorskip("moveit_msgs.srv", reason="moveit_msgs is not installed: it is not on PyPI")
+    bench.answer(to_message(bodies(), HEADER))
+    request = services.GraspPlanning.Request()
+    request.target.id = f"superquadric_{BOX}"
+    answer = bench.call(services.GraspPlanning, "/grasp_node/plan_grasps", request)
+    assert answer.error_code.val == answer.error_code.SUCCESS
+    assert {tuple(one.allowed_touch_objects) for one in answer.grasps} == {(f"superquadric_{BOX}",)}
 
 
 def test_grasps_survive_the_way_through_a_message():

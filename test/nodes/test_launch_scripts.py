@@ -198,7 +198,9 @@ def test_several_cameras_are_one_process_and_the_first_has_grasps_and_pictures(l
     assert "__ns:=/robot/front" in grasps
     assert remapped(grasps)["superquadrics"] == "recover_node/superquadrics"
     assert remapped(grasps)["support_plane"] == "recover_node/support_plane"
-    assert parameters(grasps) == ["use_sim_time: true", "gripper: robotiq_2f_85"]
+    assert parameters(grasps) == [
+        "tf_prefix: robot_front_superquadric_", "use_sim_time: true", "gripper: robotiq_2f_85",
+    ]  # fmt: skip
     shown = launch.note("rviz2")["arguments"]
     assert shown[:2] == ["-d", str(launch.prefix / "share" / "sq_perception" / "config" / "superquadrics.rviz")]
     assert shown[2:4] == ["-f", "front_optical"]
