@@ -240,7 +240,7 @@ def _means(logits: np.ndarray, some: np.ndarray) -> np.ndarray:
     """The mean of p over each of some pieces, numbers (p, p)."""
     where = some >= 0
     number = some[where]
-    return np.bincount(number, _probability(logits[where])) / np.bincount(number)
+    return np.bincount(number, _probability(logits[where])) / np.maximum(np.bincount(number), 1)
 
 
 def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.ndarray]) -> list[int]:

@@ -12,7 +12,7 @@ and the two points belong to two bodies, or to one that is not convex.  Somethin
 nothing.
 
 A line is crossed where what was seen lies behind it by ``noise`` times the square of the depth, and by ``least``
-metres, or a hundredth of the depth where that is less.  Samples are pixels on a grid.  Metres and pixels; depth is 0
+metres.  Samples are pixels on a grid.  Metres and pixels; depth is 0
 where there is none.
 """
 
@@ -39,14 +39,8 @@ _LEAST_AREA, _NEAR = 1.6e-3, 0.85
 another, is a part of that; nearer, at the same angle."""
 _STEPS = 16
 """Steps in which a line is walked: gaps between round things that touch are narrow."""
-_FINE_STEPS = 24
-"""Steps of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
 _FEWEST_LINES = 60
 """After so many lines of a pair of which none passes behind something, no more are walked."""
-_SHARE = 0.01
-"""Share of the depth beyond which the least distance behind a line does not go."""
-_HOME = 0.1
-"""A pixel leaves the part of its nearest sample only if another one's lines are so much freer."""
 
 
 def stride(pixels: int, count: int) -> int:
@@ -128,7 +122,7 @@ def _crossed(
         t = k / _STEPS
         seen = np.float64(depth[int((1 - t) * v0 + t * v1 + 0.5), int((1 - t) * u0 + t * u1 + 0.5)])
         line = 1.0 / ((1 - t) * w0 + t * w1)
-        if seen - line > max(noise * line * line, min(least, _SHARE * line)):
+        if seen - line > max(noise * line * line, least):
             return True
     return False
 
@@ -201,13 +195,13 @@ def hidden(
                     lines += 1
                     w0, w1 = 1.0 / points[i, 2], 1.0 / points[j, 2]
                     on_a, on_b, behind, is_off = 0, 0, 0, False
-                    for k in range(1, _FINE_STEPS):
-                        t = k / _FINE_STEPS
+                    for k in range(1, _STEPS):
+                        t = k / _STEPS
                         v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
                         u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
                         line = 1.0 / ((1 - t) * w0 + t * w1)
                         beyond = np.float64(depth[v, u]) - line
-                        limit = max(noise * line * line, min(least, _SHARE * line))
+                        limit = max(noise * line * line, least)
                         if beyond > limit:
                             is_off = True
                             over += 1
@@ -319,7 +313,7 @@ def assigned(
                 over = 0
                 for j in range(ends[k], ends[k + 1]):
                     over += _crossed(v, u, here, down[j], right[j], away[j], depth, noise, least)
-                share = over / (ends[k + 1] - ends[k]) + (0.0 if k == best else _HOME)
+                share = over / (ends[k + 1] - ends[k])
                 if share < least_share or (share == least_share and k == best):
                     least_share, chosen[i] = share, k
     return chosen
