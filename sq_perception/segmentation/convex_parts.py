@@ -174,7 +174,7 @@ def _crossed_between(
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,).
 
-    0 where two go on behind something nearer or are of one vessel; 1/2, which says nothing, where they are far apart.
+    0 where two go on behind something nearer or are of one vessel; inf where they are neither these nor near.
     """
     pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
     together = pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
@@ -194,13 +194,13 @@ def _crossed_between(
             before = behind[vessel[0]] * (origin[names] == wall)
             vessel = np.append(vessel, np.flatnonzero(before > _RIM * before.sum()))
             crossed[np.ix_(vessel, vessel)] = 0.0
-    return np.where(np.isinf(crossed), 0.5, crossed)
+    return crossed
 
 
 def linked(distance: np.ndarray, limit: float) -> np.ndarray:
     """Groups (n,) from 0 by average linkage: the two nearest are joined until none of (n, n) are nearer than a limit.
 
-    SciPy has it too, and loads much that a node needs for nothing else.
+    inf is no distance: that of the other one holds.
     """
     return np.unique(_linked(distance, limit), return_inverse=True)[1]
 
@@ -221,6 +221,9 @@ def _linked(distance: np.ndarray, limit: float) -> np.ndarray:
         if not far[i, j] < limit:
             return group
         mean = (size[i] * far[i] + size[j] * far[j]) / (size[i] + size[j])
+        for k in range(n):
+            if np.isinf(mean[k]):
+                mean[k] = min(far[i, k], far[j, k])
         mean[i] = np.inf
         far[i], far[:, i], far[j], far[:, j] = mean, mean, np.inf, np.inf
         size[i] += size[j]

@@ -12,7 +12,7 @@ and the two points belong to two bodies, or to one that is not convex.  Somethin
 nothing.
 
 A line is crossed where what was seen lies behind it by ``noise`` times the square of the depth, and by ``least``
-metres.  Samples are pixels on a grid.  Metres and pixels; depth is 0
+metres, or a hundredth of the depth where that is less.  Samples are pixels on a grid.  Metres and pixels; depth is 0
 where there is none.
 """
 
@@ -39,8 +39,12 @@ _LEAST_AREA, _NEAR = 1.6e-3, 0.85
 another, is a part of that; nearer, at the same angle."""
 _STEPS = 16
 """Steps in which a line is walked: gaps between round things that touch are narrow."""
-_FEWEST_LINES = 60
-"""After so many lines of a pair of which none passes behind something, no more are walked."""
+_FINE_STEPS = 24
+"""Steps of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
+_SHARE = 0.01
+"""Share of the depth beyond which the least distance behind a line does not go."""
+_HOME = 0.1
+"""A pixel leaves the part of its nearest sample only if another one's lines are so much freer."""
 
 
 def stride(pixels: int, count: int) -> int:
@@ -122,21 +126,15 @@ def _crossed(
         t = k / _STEPS
         seen = np.float64(depth[int((1 - t) * v0 + t * v1 + 0.5), int((1 - t) * u0 + t * u1 + 0.5)])
         line = 1.0 / ((1 - t) * w0 + t * w1)
-        if seen - line > max(noise * line * line, least):
+        if seen - line > max(noise * line * line, min(least, _SHARE * line)):
             return True
     return False
 
 
 @kernel
 def between(
-    pixels: np.ndarray,
-    points: np.ndarray,
-    ends: np.ndarray,
-    reach: np.ndarray,
-    beside: np.ndarray,
-    depth: np.ndarray,
-    noise: float,
-    least: float,
+    pixels: np.ndarray, points: np.ndarray, ends: np.ndarray, reach: np.ndarray, beside: np.ndarray, depth: np.ndarray,
+    noise: float, least: float,
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between the samples of each two of n segments.
 
@@ -165,15 +163,8 @@ def between(
 
 @kernel
 def hidden(
-    pixels: np.ndarray,
-    points: np.ndarray,
-    ends: np.ndarray,
-    names: np.ndarray,
-    wanted: np.ndarray,
-    depth: np.ndarray,
-    labels: np.ndarray,
-    noise: float,
-    least: float,
+    pixels: np.ndarray, points: np.ndarray, ends: np.ndarray, names: np.ndarray, wanted: np.ndarray, depth: np.ndarray,
+    labels: np.ndarray, noise: float, least: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two shares (n, n) of the lines between the samples of each two of n segments, labelled ``names`` (n,).
 
@@ -189,19 +180,19 @@ def hidden(
                 continue
             lines, found, over = 0, 0, 0
             for i in range(ends[a], ends[a + 1], 2):
-                if lines > _FEWEST_LINES and found == 0:
+                if lines > 60 and found == 0:  # most pairs have nothing before them
                     break
                 for j in range(ends[b], ends[b + 1], 2):
                     lines += 1
                     w0, w1 = 1.0 / points[i, 2], 1.0 / points[j, 2]
                     on_a, on_b, behind, is_off = 0, 0, 0, False
-                    for k in range(1, _STEPS):
-                        t = k / _STEPS
+                    for k in range(1, _FINE_STEPS):
+                        t = k / _FINE_STEPS
                         v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
                         u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
                         line = 1.0 / ((1 - t) * w0 + t * w1)
                         beyond = np.float64(depth[v, u]) - line
-                        limit = max(noise * line * line, least)
+                        limit = max(noise * line * line, min(least, _SHARE * line))
                         if beyond > limit:
                             is_off = True
                             over += 1
@@ -264,18 +255,8 @@ def _gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.
 
 @kernel
 def assigned(
-    rows: np.ndarray,
-    columns: np.ndarray,
-    samples: np.ndarray,
-    z: np.ndarray,
-    part: np.ndarray,
-    parts: int,
-    depth: np.ndarray,
-    focal: float,
-    spacing: float,
-    block: int,
-    noise: float,
-    least: float,
+    rows: np.ndarray, columns: np.ndarray, samples: np.ndarray, z: np.ndarray, part: np.ndarray, parts: int,
+    depth: np.ndarray, focal: float, spacing: float, block: int, noise: float, least: float,
 ) -> np.ndarray:
     """The part (n,) of each pixel: that of the nearest sample, or, of those almost as near, of the one to whose
     samples most lines are free.  The first pixel of each block that is so many pixels wide speaks for those at its
@@ -313,7 +294,7 @@ def assigned(
                 over = 0
                 for j in range(ends[k], ends[k + 1]):
                     over += _crossed(v, u, here, down[j], right[j], away[j], depth, noise, least)
-                share = over / (ends[k + 1] - ends[k])
+                share = over / (ends[k + 1] - ends[k]) + (0.0 if k == best else _HOME)
                 if share < least_share or (share == least_share and k == best):
                     least_share, chosen[i] = share, k
     return chosen
