@@ -123,23 +123,29 @@ def compact_pieces(cells: np.ndarray, count: int, place: tuple[float, float]) ->
     those before.  Every cell belongs to the nearest centre; centres move to the means of their cells (Lloyd 1982),
     twice, then no piece is a sliver at an end.
     """
-    at, pieces = np.argwhere(cells).astype(float), np.full(cells.shape, -1)
-    if not len(at):
-        return pieces
-    centres = at[[((at - place) ** 2).sum(axis=1).argmax()]]
-    while len(centres) < min(count, len(at)):
-        farthest = _squares(at, centres).min(axis=0).argmax()
-        centres = np.concatenate([centres, at[[farthest]]])
-    for _ in range(2):
-        of = _squares(at, centres).argmin(axis=0)
-        centres = np.stack([at[of == k].mean(axis=0) for k in np.unique(of)])
-    pieces[cells] = np.unique(_squares(at, centres).argmin(axis=0), return_inverse=True)[1]
+    pieces = np.full(cells.shape, -1)
+    pieces[cells] = _compact(np.argwhere(cells).astype(float), count, float(place[0]), float(place[1]))
     return pieces
 
 
-def _squares(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """Squares (m, n) of the distances of points (n, 2) from centres (m, 2)."""
-    return np.asarray((points[:, 0] - centres[:, :1]) ** 2 + (points[:, 1] - centres[:, 1:]) ** 2)
+@kernel
+def _compact(at: np.ndarray, count: int, row: float, column: float) -> np.ndarray:
+    """The piece of each of some places (n, 2), as by :func:`compact_pieces`; a number whose piece is empty is left."""
+    count = min(count, len(at))
+    centres, of = np.empty((count, 2)), np.zeros(len(at), np.int64)
+    square = (at[:, 0] - row) ** 2 + (at[:, 1] - column) ** 2
+    for k in range(count):
+        centres[k] = at[square.argmax()]
+        from_it = (at[:, 0] - centres[k, 0]) ** 2 + (at[:, 1] - centres[k, 1]) ** 2
+        square = from_it if k == 0 else np.minimum(square, from_it)
+    for step in range(3):
+        for i in range(len(at)):
+            of[i] = ((centres[:, 0] - at[i, 0]) ** 2 + (centres[:, 1] - at[i, 1]) ** 2).argmin()
+        for k in range(count if step < 2 else 0):
+            some = at[of == k]
+            if len(some):
+                centres[k] = some[:, 0].mean(), some[:, 1].mean()
+    return of
 
 
 @kernel

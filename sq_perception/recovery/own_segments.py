@@ -44,16 +44,12 @@ _ONE = (0.5, -0.5)
 """k and c: of a logistic regression over pairs of segments of simulated scenes."""
 _CLEAREST = 6.0
 """A logit tells no more than this, either way."""
-_PIECES = 4
-"""Pieces of a segment.  Each should show one thing, and enough of it to tell things apart."""
 _SURE = 0.85
 """A segment is parted only if a piece of it claims less."""
 _APART, _ITSELF = 0.3, 0.5
 """Pieces that claim less of each other are of two objects; one that claims less of itself shows none."""
-_LEAST_TO_PART = 60
-"""Cells of a segment that may be parted: 15 in a piece."""
-_LEAST_CELLS = 4
-"""Cells that another segment has in a view at least, for a mean over them."""
+_LEAST_TO_PART, _LEAST_CELLS = 60, 4
+"""Cells in a view, of a segment that may be parted, and of another segment for a mean over them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +227,7 @@ def _doubt(answer: _Seen) -> _Doubt | None:
     rows, columns = np.nonzero(cells)
     if len(rows) < _LEAST_TO_PART:
         return None
-    some = segment_view.compact_pieces(cells, _PIECES, (rows.mean(), columns.mean()))
+    some = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
     sure = _means(answer.logits, some)
     return _Doubt(answer.view, some, sure) if sure.min() < _SURE else None
 
@@ -240,7 +236,7 @@ def _means(logits: np.ndarray, some: np.ndarray) -> np.ndarray:
     """The mean of p over each of some pieces, numbers (p, p)."""
     where = some >= 0
     number = some[where]
-    return np.bincount(number, _probability(logits[where])) / np.bincount(number)
+    return np.bincount(number, _probability(logits[where])) / np.maximum(np.bincount(number), 1)
 
 
 def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.ndarray]) -> list[int]:

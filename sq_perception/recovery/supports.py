@@ -35,18 +35,12 @@ _FEWEST = 15
 """Points of a top, of some thousand of its object."""
 _NOT_ON_IT = 0.1
 """Metres above its plane from which on what is beside an object may hold it."""
-_BESIDE = (3, 8)
-"""Pixels from an object at which something else is beside it: nearer, a sensor widens its edges."""
 _HELD = 0.15
 """Share of what is beside an object from which on it is held by what is of no object, and not on the plane either."""
 
 
 def support(
-    obj: SeenObject,
-    others: Iterable[SeenObject],
-    depth: np.ndarray,
-    camera: Camera,
-    found: FrameEvidence,
+    obj: SeenObject, others: Iterable[SeenObject], depth: np.ndarray, camera: Camera, found: FrameEvidence,
     options: SegmentationOptions,
 ) -> np.ndarray | None:
     """The plane (4,) that the object stands on; None where it stands on nothing that is known.
@@ -89,7 +83,7 @@ def _is_held(
 ) -> bool:
     """Whether something holds an object from the side: readings of no object, not behind it and higher than its lowest
     pixels, which are ``low`` metres above a plane, along a good part of its outline."""
-    nearest, farthest = _BESIDE
+    nearest, farthest = 3, 8  # pixels: nearer, a sensor widens its edges
     _, near, names, view = surroundings(obj, depth, labels, camera, farthest)
     own = (names == obj.label).view(np.uint8)
     outer, inner = (cv2.dilate(own, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (farthest, nearest))

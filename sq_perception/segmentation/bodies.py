@@ -68,9 +68,10 @@ def _low(relative: np.ndarray, valid: np.ndarray, clear_height: float) -> tuple[
     """
     # What is higher counts as if it were just clear, so that tall bodies do not raise what is beside them.
     wide = cv2.blur(np.minimum(relative, clear_height), (_WIDE, _WIDE))
-    share = cv2.blur(valid.astype(np.float32), (_WIDE, _WIDE))
+    rows, columns = (length // _WIDE for length in valid.shape)
     apart = slice(_WIDE // 2, None, _WIDE)
-    means = np.abs(wide[apart, apart])[share[apart, apart] > 0.99]
+    is_full = valid[: rows * _WIDE, : columns * _WIDE].reshape(rows, _WIDE, columns, _WIDE).all(axis=(1, 3))
+    means = np.abs(wide[apart, apart][:rows, :columns])[is_full]
     means = means[means < clear_height]
     if not means.size:
         return np.zeros(valid.shape, bool), np.zeros(valid.shape, bool)

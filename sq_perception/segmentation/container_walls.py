@@ -40,37 +40,48 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
     plane : (4,)
         The plane that they stand on.
     """
+    if len(points) < 3:
+        return set()
     axes = across(plane[:3])
     tops = {label: quantile(some @ plane[:3] + plane[3], _TOP) for label, some in points.items()}
-    flat = {label: (some @ axes).T for label, some in points.items()}
+    flat = {label: axes.T @ some.T for label, some in points.items()}
+    axis = {label: _axis(some) for label, some in flat.items()}
     tried: list[list[int]] = []
     for top in tops.values():
         level = [label for label, other in tops.items() if abs(other - top) < _AS_HIGH]
-        if len(level) > 1 and len(points) > 2 and level not in tried:
+        if len(level) > 1 and level not in tried:
             tried.append(level)
-            if along := _around(level, flat):
+            longest = max(level, key=lambda label: float(np.hypot(*axis[label])))
+            if along := _around(level, flat, axis[longest]):
                 return along
     return set()
 
 
-def _around(level: list[int], points: Mapping[int, np.ndarray]) -> set[int]:
-    """Which of some equally high segments are walls along the rectangle around them, as the longest of them lies.
+def _axis(points: np.ndarray) -> np.ndarray:
+    """Twice the angle of the principal axis of points (2, n), as a vector as long as their variances differ."""
+    x, y = points - points.sum(axis=1, keepdims=True) / points.shape[1]
+    return np.array([x @ x - y @ y, 2 * (x @ y)]) / len(x)
+
+
+def _around(level: list[int], points: Mapping[int, np.ndarray], axis: np.ndarray) -> set[int]:
+    """Which of some equally high segments are walls along the rectangle around them that lies along an axis.
 
     Not the smallest rectangle: two walls at a right angle have another one just as small.  ``points`` (2, n) are those
     of all segments along the support.
     """
-    moments = [np.linalg.eigh(np.cov(points[label])) for label in level]
-    directions = max(moments, key=lambda each: float(np.ptp(each[0])))[1].T
-    ends = np.concatenate([directions @ points[label] for label in level], axis=1)
-    low, high = ends.min(axis=1), ends.max(axis=1)
+    angle = 0.5 * np.arctan2(axis[1], axis[0])
+    directions = np.array([[-np.sin(angle), np.cos(angle)], [np.cos(angle), np.sin(angle)]])
+    placed = {label: directions @ some for label, some in points.items()}
+    around = np.concatenate([placed[label] for label in level], axis=1)
+    low, high = around.min(axis=1), around.max(axis=1)
     half = np.maximum((high - low) / 2, 1e-9)  # of points on one line
     thick = min(_THICK, 0.2 * float(half.min()))
-    placed = {label: directions @ some - (low + half)[:, None] for label, some in points.items()}
-    within = {label: (half[:, None] - np.abs(some)).min(axis=0) > thick for label, some in placed.items()}
-    along = {label for label in level if within[label].mean() < _OUTLYING}
-    if not any(np.median(within[label]) > 0 for label in points.keys() - along) or not along:
+    middle, reach = ((low + high) / 2)[:, None], (half - thick)[:, None]
+    within = {label: float((np.abs(some - middle) < reach).all(axis=0).mean()) for label, some in placed.items()}
+    along = {label for label in level if within[label] < _OUTLYING}
+    if not along or all(within[label] < 0.5 for label in points.keys() - along):
         return set()
-    of_walls = np.concatenate([placed[label] for label in along], axis=1) / half[:, None]
+    of_walls = (np.concatenate([placed[label] for label in along], axis=1) - middle) / half[:, None]
     cell = np.clip((_CELLS * (of_walls / 2 + 0.5)).astype(int), 0, _CELLS - 1)
     # Of the four sides in their order around the rectangle, the share of their cells that hold points beside them.
     beside = [(1 - sign * of_walls[k]) * half[k] < thick for sign in (1, -1) for k in (0, 1)]

@@ -75,11 +75,8 @@ def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: floa
     # The one layout that kernels are compiled for; labels are written to.
     image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C"), camera, sigma)
     rims = _rims(image)
-    origin = _part(image)
-    extents = regions.extents(image.labels)
-    sampled = [image.sampled(k, extents[k], _FEW) for k in np.flatnonzero(extents[:, 0]).tolist()]
-    parts = [part for part in sampled if part is not None]
-    number_of = np.arange(len(extents), dtype=np.int32)
+    parts, origin = _part(image)
+    number_of = np.arange(len(origin), dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
         crossed = _crossed_between(image, parts, names, origin, rims)
@@ -106,30 +103,39 @@ def _rims(image: SampledImage) -> np.ndarray:
     return np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :]))
 
 
-def _part(image: SampledImage) -> np.ndarray:
-    """Give the parts of segments that are several convex bodies labels of their own, in the image; for each label the
-    one of the segment that it was a part of."""
+def _part(image: SampledImage) -> tuple[list[Samples], np.ndarray]:
+    """Give the parts of segments that are several convex bodies labels of their own, in the image.
+
+    Returns samples of all segments and parts that are large enough to have some, and for each label the one of the
+    segment that it was a part of.
+    """
     extents = regions.extents(image.labels)
     origin = list(range(len(extents)))
-    for label in np.flatnonzero(extents[:, 0]).tolist():
-        for rows, columns in _pieces(image, label, extents[label])[1:]:
+    parts, new = {k: image.sampled(k, extents[k], _FEW) for k in np.flatnonzero(extents[:, 0]).tolist()}, []
+    for label, part in parts.items():
+        pieces = [] if part is None else _pieces(image, part, extents[label])
+        new += [label] if pieces else []
+        for rows, columns in pieces[1:]:
             image.labels[rows, columns] = len(origin)
+            new.append(len(origin))
             origin.append(label)
-    return np.array(origin)
+    if new:
+        extents = regions.extents(image.labels)
+        parts |= {k: image.sampled(k, extents[k], _FEW) for k in new}
+    return [part for part in parts.values() if part is not None], np.array(origin)
 
 
-def _pieces(image: SampledImage, label: int, extent: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Rows and columns of each convex piece of a segment; nothing where it has no such pieces.
 
-    ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
+    ``part`` are a few samples of it, ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
     """
-    part = image.sampled(label, extent, _FEW)
-    if part is None or part.area < 2 * _LEAST_SHARE * least_area(part.distance):
+    if part.area < 2 * _LEAST_SHARE * least_area(part.distance):
         return []
     crossed, _ = line_of_sight.within(part.pixels, part.points, image.depth, *image.limits)
     if crossed.mean() < _SUSPICIOUS:
         return []
-    whole = image.sampled(label, extent, _MANY)
+    whole = image.sampled(part.label, extent, _MANY)
     assert whole is not None  # no fewer than a few
     crossed, far = line_of_sight.within(whole.pixels, whole.points, image.depth, *image.limits)
     group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), _APART)
@@ -144,7 +150,7 @@ def _pieces(image: SampledImage, label: int, extent: np.ndarray) -> list[tuple[n
     count = int(group.max()) + 1
     if count < 2:
         return []
-    rows, columns = regions.pixels(image.labels, label, extent)
+    rows, columns = regions.pixels(image.labels, part.label, extent)
     block = max(1, stride(len(rows), _MANY) // 4)
     seen = image.depth, image.focal, whole.spacing, block, *image.limits
     chosen = line_of_sight.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
@@ -168,7 +174,7 @@ def _crossed_between(
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,).
 
-    0 where two go on behind something nearer or are of one vessel; 1/2, which says nothing, where they are far apart.
+    0 where two go on behind something nearer or are of one vessel; inf where they are neither these nor near.
     """
     pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
     together = pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
@@ -188,13 +194,13 @@ def _crossed_between(
             before = behind[vessel[0]] * (origin[names] == wall)
             vessel = np.append(vessel, np.flatnonzero(before > _RIM * before.sum()))
             crossed[np.ix_(vessel, vessel)] = 0.0
-    return np.where(np.isinf(crossed), 0.5, crossed)
+    return crossed
 
 
 def linked(distance: np.ndarray, limit: float) -> np.ndarray:
     """Groups (n,) from 0 by average linkage: the two nearest are joined until none of (n, n) are nearer than a limit.
 
-    SciPy has it too, and loads much that a node needs for nothing else.
+    inf is no distance: that of the other one holds.
     """
     return np.unique(_linked(distance, limit), return_inverse=True)[1]
 
@@ -215,6 +221,9 @@ def _linked(distance: np.ndarray, limit: float) -> np.ndarray:
         if not far[i, j] < limit:
             return group
         mean = (size[i] * far[i] + size[j] * far[j]) / (size[i] + size[j])
+        for k in range(n):
+            if np.isinf(mean[k]):
+                mean[k] = min(far[i, k], far[j, k])
         mean[i] = np.inf
         far[i], far[:, i], far[j], far[:, j] = mean, mean, np.inf, np.inf
         size[i] += size[j]

@@ -58,51 +58,25 @@ def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -
     """Some hundred points (n, 3) of each segment of at least so many pixels, evenly taken; the largest one first."""
     extents = regions.extents(labels)
     order = np.argsort(-extents[:, 0], kind="stable")
-    order = order[(extents[order, 0] >= least) & (order > 0)]
-    return {int(label): _points(labels, int(label), extents[label], depth, camera, POINTS) for label in order}
+    order = order[(extents[order, 0] >= least) & (order > 0)].tolist()
+    return {k: regions.some_points(*regions.pixels(labels, k, extents[k]), depth, camera, POINTS) for k in order}
 
 
 def found(
-    segments: Mapping[int, np.ndarray],
-    labels: np.ndarray,
-    depth: np.ndarray,
-    camera: Camera,
-    support: SupportSurface,
+    segments: Mapping[int, np.ndarray], labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface,
     least: int,
 ) -> list[LevelFace]:
-    """The level faces of segments that have one, and at least ``least`` pixels above it; in the order of ``segments``.
-
-    Parameters
-    ----------
-    segments
-        Samples of the segments of the image, as :func:`samples` gives them.
-    labels : int32 (height, width)
-        Segments from 1.
-    depth : (height, width)
-        Metres; every segment has one.
-    camera
-        A pinhole camera.
-    support
-        What the segments stand on.
-    least
-        Pixels of an object.
-    """
+    """The level faces of segments that have one, and at least ``least`` pixels above it; in the order of ``segments``,
+    which are samples of what stands on the ``support``, as :func:`samples` gives them."""
     seen = {label: face for label, points in segments.items() if (face := _face(points, support)) is not None}
     extents = regions.extents(labels) if seen else np.empty(0)
     faces = []
     for label, face in seen.items():
-        everything = _points(labels, label, extents[label], depth, camera, labels.size)
+        everything = camera.unproject(*(pixels := regions.pixels(labels, label, extents[label]))[::-1], depth[pixels])
         off = face.plane.height(everything) / noise_growth(everything[:, 2])
         if np.count_nonzero(off > face.clear_height) >= least:
             faces.append(LevelFace(label, face, segments[label]))
     return faces
-
-
-def _points(
-    labels: np.ndarray, label: int, extent: np.ndarray, depth: np.ndarray, camera: Camera, count: int
-) -> np.ndarray:
-    """Points (n, 3) of a segment, evenly taken, at least ``count`` of them or all."""
-    return regions.some_points(*regions.pixels(labels, label, extent), depth, camera, count)
 
 
 def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:

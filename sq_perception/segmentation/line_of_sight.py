@@ -41,8 +41,6 @@ _STEPS = 16
 """Steps in which a line is walked: gaps between round things that touch are narrow."""
 _FINE_STEPS = 24
 """Steps of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
-_FEWEST_LINES = 60
-"""After so many lines of a pair of which none passes behind something, no more are walked."""
 _SHARE = 0.01
 """Share of the depth beyond which the least distance behind a line does not go."""
 _HOME = 0.1
@@ -135,14 +133,8 @@ def _crossed(
 
 @kernel
 def between(
-    pixels: np.ndarray,
-    points: np.ndarray,
-    ends: np.ndarray,
-    reach: np.ndarray,
-    beside: np.ndarray,
-    depth: np.ndarray,
-    noise: float,
-    least: float,
+    pixels: np.ndarray, points: np.ndarray, ends: np.ndarray, reach: np.ndarray, beside: np.ndarray, depth: np.ndarray,
+    noise: float, least: float,
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between the samples of each two of n segments.
 
@@ -171,15 +163,8 @@ def between(
 
 @kernel
 def hidden(
-    pixels: np.ndarray,
-    points: np.ndarray,
-    ends: np.ndarray,
-    names: np.ndarray,
-    wanted: np.ndarray,
-    depth: np.ndarray,
-    labels: np.ndarray,
-    noise: float,
-    least: float,
+    pixels: np.ndarray, points: np.ndarray, ends: np.ndarray, names: np.ndarray, wanted: np.ndarray, depth: np.ndarray,
+    labels: np.ndarray, noise: float, least: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Two shares (n, n) of the lines between the samples of each two of n segments, labelled ``names`` (n,).
 
@@ -195,7 +180,7 @@ def hidden(
                 continue
             lines, found, over = 0, 0, 0
             for i in range(ends[a], ends[a + 1], 2):
-                if lines > _FEWEST_LINES and found == 0:
+                if lines > 60 and found == 0:  # most pairs have nothing before them
                     break
                 for j in range(ends[b], ends[b + 1], 2):
                     lines += 1
@@ -270,18 +255,8 @@ def _gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.
 
 @kernel
 def assigned(
-    rows: np.ndarray,
-    columns: np.ndarray,
-    samples: np.ndarray,
-    z: np.ndarray,
-    part: np.ndarray,
-    parts: int,
-    depth: np.ndarray,
-    focal: float,
-    spacing: float,
-    block: int,
-    noise: float,
-    least: float,
+    rows: np.ndarray, columns: np.ndarray, samples: np.ndarray, z: np.ndarray, part: np.ndarray, parts: int,
+    depth: np.ndarray, focal: float, spacing: float, block: int, noise: float, least: float,
 ) -> np.ndarray:
     """The part (n,) of each pixel: that of the nearest sample, or, of those almost as near, of the one to whose
     samples most lines are free.  The first pixel of each block that is so many pixels wide speaks for those at its

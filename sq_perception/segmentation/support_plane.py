@@ -46,10 +46,8 @@ far from all planes, it says nothing."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
-_SAMPLES = 120
+_SAMPLES = 60
 """Samples along the shorter side of the image that the surface is fitted to."""
-_TERMS = 6
-"""Coefficients of a quadratic surface."""
 CLEARLY = 4.0
 """Standard deviations of the noise from which on a height is none of it."""
 _DISTORTION = 0.02
@@ -288,7 +286,7 @@ class SupportSurface:
 
 def flat(plane: Plane) -> SupportSurface:
     """A plane that is not known to be bent."""
-    return SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
+    return SupportSurface(plane, np.zeros(6), 0.0, plane.sigma)
 
 
 def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
@@ -313,46 +311,16 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     if not on.any():
         return flat(plane)
     limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
-    bend, off = np.zeros(_TERMS), height
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     for _ in range(6):
-        gram, right = _normal_equations(x, y, height, off)
-        if gram[0, 0] < 10 * _TERMS:
+        if np.count_nonzero(on) < 10 * len(terms):
             return flat(plane)
-        bend = np.linalg.lstsq(gram, right, rcond=None)[0]
-        off, is_settled = _off(x, y, height, bend, limit, off)
-        if is_settled:
+        bend = np.linalg.lstsq((terms * on) @ terms.T, terms @ (on * height), rcond=None)[0]
+        off, last = np.abs(height - np.clip(bend @ terms, -limit, limit)), on
+        on = off < TOLERANCE
+        if np.array_equal(on, last):
             break
-    within = np.abs(off)
-    return SupportSurface(plane, bend, limit, deviation(within[within < TOLERANCE]))
-
-
-@kernel
-def _normal_equations(
-    x: np.ndarray, y: np.ndarray, height: np.ndarray, off: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The normal equations of b by least squares, from the heights of samples within the tolerance of the last b."""
-    gram, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
-    for i in range(len(x)):
-        if abs(off[i]) < TOLERANCE:
-            term = (1.0, x[i], y[i], x[i] * x[i], x[i] * y[i], y[i] * y[i])
-            for j in range(_TERMS):
-                right[j] += term[j] * height[i]
-                for k in range(_TERMS):
-                    gram[j, k] += term[j] * term[k]
-    return gram, right
-
-
-@kernel
-def _off(
-    x: np.ndarray, y: np.ndarray, height: np.ndarray, bend: np.ndarray, limit: float, last: np.ndarray
-) -> tuple[np.ndarray, bool]:
-    """Heights above a bent support, and whether those within the tolerance are the same as last time."""
-    off, is_same = np.empty_like(height), True
-    for i in range(len(x)):
-        b = bend[0] + x[i] * (bend[1] + bend[3] * x[i] + bend[4] * y[i]) + y[i] * (bend[2] + bend[5] * y[i])
-        off[i] = height[i] - min(max(b, -limit), limit)
-        is_same &= (abs(off[i]) < TOLERANCE) == (abs(last[i]) < TOLERANCE)
-    return off, is_same
+    return SupportSurface(plane, bend, limit, deviation(off[on]))
 
 
 @kernel
