@@ -37,7 +37,7 @@ from sq_perception.geometry.union import DIRECTIONS
 Stages: TypeAlias = tuple[tuple[int, int, int], ...]
 MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
-_STAGES, STAGES_OF_PARTS = ((200, 3, 24), (400, 8, 3)), ((400, 4, 24), (800, 8, 4))
+_STAGES, STAGES_OF_PARTS = ((200, 2, 24), (400, 6, 3)), ((400, 4, 24), (800, 8, 4))
 """Points, rounds and most bodies of each stage of the search: for one body, and for the first one of a union."""
 _OF_STARTS = 500
 """Points that starts are made from, about."""
