@@ -67,7 +67,8 @@ which nothing was seen leaves no room between parts."""
 _JOINT_SPREAD = 2.0
 """Factor of the covariance of a part: where one ends and the next one begins is not seen."""
 _FINE = 1.3
-"""L of good bodies, mostly: where one leaves no more than the price above it, two are not sought."""
+"""L of good bodies, mostly: where one leaves no more than the price above it, two are not sought, nor handles where
+parts do."""
 _SAME = 0.9
 """IoU of the pixels of two pieces from which on they have one body."""
 
@@ -160,6 +161,8 @@ class Search:
                 milliseconds = sum(fit.milliseconds for fit in fits)
                 wide = [replace(fit, covariance=_JOINT_SPREAD * fit.covariance) for fit in fits]
                 self.parts = Parts.of(wide, weight.shares, self._noise, milliseconds)
+                if weight.misfit <= _FINE + _PRICE:
+                    del self._divisions[1:]
                 return
         self._divisions.pop(0)
 
