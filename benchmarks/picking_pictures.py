@@ -3,6 +3,7 @@
     python benchmarks/picking_pictures.py --scenes docs/grasping.png
     python benchmarks/picking_pictures.py --film docs/picking.gif [--kind packed] [--seed 5001]
     python benchmarks/picking_pictures.py --failures docs/grasp_failures.png --each runs/picking.jsonl
+    python benchmarks/picking_pictures.py --handles docs/grasp_handles.png
 
 A failure is shown by the first pick of that cause in the lines of a run, of ours where there is one: what the sensor
 saw, the body that was planned on, and the gripper where it was sent.  Scenes are computed again from their seeds.
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import parts
 import picking
 from common import picking_contestants, picking_scenes, report
 from common.picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA
@@ -27,12 +29,17 @@ from sq_perception.evaluation import plots
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.plan import GraspPlan
+from sq_perception.grasping.planner import grasps_of
+from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
+from sq_perception.simulation.household import KINDS as KINDS_OF_THINGS
 from sq_perception.simulation.rendering import render_things
 
 SHOWN = (150.0, 490.0, 65.0, 335.0)
 """Left, right, top, bottom of a picture, pixels."""
+TOOLS = (3004, 3010, 3043)
+"""Seeds of tools whose best grasp is on the handle."""
 CAUSES = {
     "collision": "collision with the table or another thing",
     "wrong size": "the fingers do not pass the thing",
@@ -60,6 +67,28 @@ def scenes(path: Path, seed: int, recoverer: Recoverer) -> None:
         plan = seen.plan(bodies, np.array([one.covariance for one in seen.recovery.recovered]))
         _draw(ax, depth, bodies, plan, f"{kind}, {scene.sensor}")
     plots.save(figure, path, dots_per_inch=90)
+
+
+def handles(path: Path, recoverer: Recoverer) -> None:
+    """Tools of benchmarks/parts with their parts, and the best grasp of each, on the part that it holds."""
+    figure = plots.new_figure(3.6 * len(TOOLS), 3.6)
+    for column, seed in enumerate(TOOLS):
+        made = parts.seen_scene(["tool"], 1, [KINDS_OF_THINGS.index("tool"), seed])
+        assert made is not None
+        truth, depth = made
+        found = recoverer.recover(depth, truth.camera, truth.labels, parts.WITH_PARTS)
+        around = Surroundings.of_image(depth, truth.camera, found.plane)
+        best = grasps_of(found.recovered, GRIPPER, around).grasps[0]
+        solids = list(found.recovered[0].solids)
+        held = int(np.argmin([solid.gauge(best.position[None])[0] for solid in solids]))
+        rows, columns = np.nonzero(truth.labels)
+        middle, reach = np.array([columns.mean(), rows.mean()]), 0.8 * max(np.ptp(columns), np.ptp(rows))
+        (left, top), (right, bottom) = middle - reach, middle + reach
+        ax = figure.add_axes((column / len(TOOLS) + 0.002, 0.0, 1 / len(TOOLS) - 0.004, 1.0))
+        plots.draw_outlines(ax, solids, truth.camera, [plots.colour(1)] * len(solids), edges=False, width=1.4)
+        plan, window = GraspPlan((replace(best, body=0),)), (left, right, top, bottom)
+        plots.draw_grasps(ax, depth, truth.camera, [solids[held]], plan, GRIPPER, window=window)
+    plots.save(figure, path, dots_per_inch=80)
 
 
 def failures(path: Path, lines: list[dict[str, Any]]) -> dict[str, str]:
@@ -138,6 +167,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, metavar="PNG")
     parser.add_argument("--film", type=Path, metavar="GIF")
     parser.add_argument("--failures", type=Path, metavar="PNG")
+    parser.add_argument("--handles", type=Path, metavar="PNG")
     parser.add_argument("--each", type=Path, help="lines of picking.py, for --failures")
     parser.add_argument("--kind", default="packed", choices=KINDS)
     parser.add_argument("--seed", type=int, default=5000)
@@ -146,6 +176,8 @@ def main() -> None:
         scenes(arguments.scenes, arguments.seed, Recoverer())
     if arguments.film:
         film(arguments.film, arguments.kind, arguments.seed, Recoverer())
+    if arguments.handles:
+        handles(arguments.handles, Recoverer())
     if arguments.failures:
         if not arguments.each:
             parser.error("--failures needs --each")

@@ -84,13 +84,6 @@ class UnitCloud:
             turned = normals[order] @ axes / np.where(length > 0, length, 1.0)
         return cls(np.ascontiguousarray(centred[order]), turned, centre, axes, scale)
 
-    def densest(self, share: float) -> np.ndarray:
-        """The points (n, 3) with the nearest neighbours, this share of all."""
-        from scipy.spatial import cKDTree  # here: a node that recovers does without
-
-        reach = cKDTree(self.points).query(self.points, k=min(_NEIGHBOURS, len(self.points)))[0][:, -1]
-        return self.points[np.argsort(reach, kind="stable")[: max(3, round(share * len(self.points)))]]
-
     @property
     def extent(self) -> float:
         """Half of the diagonal of the box, in units of the cloud."""
@@ -123,6 +116,14 @@ class UnitCloud:
             quaternions.from_matrix(self.axes @ turn),
             numbers[8:10],
         )
+
+
+def densest(points: np.ndarray, share: float) -> np.ndarray:
+    """The points (n, 3) with the nearest neighbours, this share of all."""
+    from scipy.spatial import cKDTree  # here: a node that recovers does without
+
+    reach = cKDTree(points).query(points, k=min(_NEIGHBOURS, len(points)))[0][:, -1]
+    return points[np.argsort(reach, kind="stable")[: max(3, round(share * len(points)))]]
 
 
 def _morton(points: np.ndarray) -> np.ndarray:

@@ -26,7 +26,7 @@ import numpy as np
 from sq_perception.fitting import point_cost
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import EXPONENTS, LARGEST_SIZE, MIN_PIXELS, SMALLEST_SIZE
-from sq_perception.fitting.point_cloud import UnitCloud, finite_points
+from sq_perception.fitting.point_cloud import UnitCloud, densest, finite_points
 from sq_perception.fitting.point_cost import BODY_LENGTH, STEP_LENGTH, Cloud, Course, Mixture, Prior
 from sq_perception.fitting.quality import carried_over, seen_extents
 from sq_perception.fitting.quality import status as assess
@@ -37,8 +37,10 @@ from sq_perception.geometry.union import DIRECTIONS
 Stages: TypeAlias = tuple[tuple[int, int, int], ...]
 MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
-_STAGES, STAGES_OF_PARTS = ((200, 3, 24), (400, 8, 3)), ((400, 4, 24), (800, 8, 4))
+_STAGES, STAGES_OF_PARTS = ((200, 2, 24), (400, 6, 3)), ((400, 4, 24), (800, 8, 4))
 """Points, rounds and most bodies of each stage of the search: for one body, and for the first one of a union."""
+_OF_STARTS = 500
+"""Points that starts are made from, about."""
 _COARSE = 0.02
 """Least noise of the search, in radii of the cloud: a part that is a perfect superquadric is not the whole thing."""
 _LAST_ROUNDS = 40
@@ -220,11 +222,12 @@ def _starts(cloud: UnitCloud) -> list[tuple[np.ndarray, np.ndarray]]:
     They are those of all points and those of the densest: outliers are spread through a volume, and so are sparse.
     """
     found = []
-    for some in (cloud.points, cloud.densest(_DENSE)):
+    few = cloud.surface(_OF_STARTS).points
+    for some in (few, densest(few, _DENSE)):
         principal = np.linalg.eigh(np.cov(some.T))[1]
         principal *= math.copysign(1.0, float(np.linalg.det(principal)))
         for turn in principal @ _EIGHTH_TURNS:
-            low, high = np.quantile(some @ turn, [0.05, 0.95], axis=0)
+            low, high = np.sort(some @ turn, axis=0)[[len(some) // 20, -1 - len(some) // 20]]
             half = np.maximum((high - low) / 2, SMALLEST_SIZE * cloud.extent)
             for order in ORDERS:
                 body = np.array([*half[order], 0.5, 0.5, *(turn @ (low + high) / 2), 0.0, 0.0])

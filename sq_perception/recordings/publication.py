@@ -103,6 +103,7 @@ def identify(
             known.append((FIRST_FAILED_ID + body.label, 0, False, 0))
             continue
         track = next(left)
+        body = replace(body, cavity=track.cavity)
         bodies.append(
             replace(body, fit=replace(body.fit, superquadric=track.superquadric, covariance=track.covariance))
         )

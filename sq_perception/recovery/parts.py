@@ -3,8 +3,10 @@
 Proposals.  Two points of a convex body are joined by a line that no pixel saw through (the equation is that of
 :mod:`sq_perception.segmentation.convex_parts`).  Samples of the object's pixels are clustered by average linkage, the
 distance being 1 for a crossed line and 0 for any other, and a little of the metric one; each limit of the distance
-divides the pixels into pieces.  A piece is fitted like an object of its own: other pieces' pixels beside it saw free
-space, up to what they measured.  So a part is what some pixels show: what no pixel shows is no part.
+divides the pixels into pieces.  Where these divide no further, those of a handle are tried: what is left of the
+object's pixels without all discs in them that are nearly as wide as the widest.  A piece is fitted like an object of
+its own: other pieces' pixels beside it saw free space, up to what they measured.  So a part is what some pixels show:
+what no pixel shows is no part.
 
 Evidence.  With r the rendered less the measured depth over the noise s, of each of the n pixels of the object, 3 for
 one that no body covers, and m the pixels beside it that saw through a body by more than 3 s, k bodies leave
@@ -24,6 +26,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from sq_perception.fitting.fit import Fit, Parts, Status
@@ -42,6 +45,8 @@ _SAMPLES = 120
 """Samples of an object between which lines are drawn."""
 _LIMITS = (0.55, 0.35, 0.2)
 """Distances between clusters up to which they are one piece."""
+_WIDE = 0.7
+"""Radius of wide discs, as a share of that of the widest one in an object."""
 _METRIC = 0.3
 """What the metric distance adds to that between samples, at most."""
 _LEAST_SHARE = 0.03
@@ -62,7 +67,8 @@ which nothing was seen leaves no room between parts."""
 _JOINT_SPREAD = 2.0
 """Factor of the covariance of a part: where one ends and the next one begins is not seen."""
 _FINE = 1.3
-"""L of good bodies, mostly: where one leaves no more than the price above it, two are not sought."""
+"""L of good bodies, mostly: where one leaves no more than the price above it, two are not sought, nor handles where
+parts do."""
 _SAME = 0.9
 """IoU of the pixels of two pieces from which on they have one body."""
 
@@ -117,7 +123,7 @@ class Search:
         self._noise = alone.noise
         self.parts: Parts | None = None
         """The best ones so far; None where one body is the shorter description."""
-        self._divisions: Iterator[list[SeenObject]] = iter(())
+        self._divisions: list[Iterator[list[SeenObject]]] = []
         self._fitted: list[tuple[SeenObject, Fit]] = []
         self._fresh: list[SeenObject] = []
         self._again: list[Fit] = []
@@ -128,23 +134,23 @@ class Search:
         weight = self._evidence.weigh([alone])
         self._least = weight.misfit
         if weight.misfit > _FINE + _PRICE and weight.through > _OPEN:
-            pieces = _divide(obj, _THROUGH * alone.noise)
-            self._divisions = (list(_make_objects(obj, depth, camera, each)) for each in pieces)
+            kinds = _divide(obj, _THROUGH * alone.noise), _divide_thin(obj)
+            self._divisions = [(list(_make_objects(obj, depth, camera, each)) for each in kind) for kind in kinds]
 
     def next_pieces(self) -> list[SeenObject]:
         """Return the pieces of the next division that have no body yet; none where the search has ended."""
-        for pieces in self._divisions:
-            known = [(piece, [fit for other, fit in self._fitted if _is_same(piece, other)]) for piece in pieces]
-            self._fresh = [piece for piece, fits in known if not fits]
-            self._again = [fits[0] for _, fits in known if fits]
-            if self._fresh:
-                break
-        else:
-            self._fresh = []
-        return self._fresh
+        while self._divisions:
+            for pieces in self._divisions[0]:
+                known = [(piece, [fit for other, fit in self._fitted if _is_same(piece, other)]) for piece in pieces]
+                self._fresh = [piece for piece, fits in known if not fits]
+                self._again = [fits[0] for _, fits in known if fits]
+                if self._fresh:
+                    return self._fresh
+            self._divisions.pop(0)
+        return []
 
     def judge(self, fits: Sequence[Fit]) -> None:
-        """Keep a division, given the bodies of its fresh pieces, or end the search if it is no shorter."""
+        """Keep a division, given the bodies of its fresh pieces; where it is no shorter, no finer one follows."""
         self._fitted += zip(self._fresh, fits, strict=True)
         fits = [fit for fit in (*fits, *self._again) if fit.status != Status.FAILED]
         if len(fits) > 1:
@@ -155,8 +161,10 @@ class Search:
                 milliseconds = sum(fit.milliseconds for fit in fits)
                 wide = [replace(fit, covariance=_JOINT_SPREAD * fit.covariance) for fit in fits]
                 self.parts = Parts.of(wide, weight.shares, self._noise, milliseconds)
+                if weight.misfit <= _FINE + _PRICE:
+                    del self._divisions[1:]
                 return
-        self._divisions = iter(())
+        self._divisions.pop(0)
 
 
 def _is_same(one: SeenObject, other: SeenObject) -> bool:
@@ -193,6 +201,23 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
         divided = np.zeros_like(labels)
         divided[rows, columns] = piece + 1
         yield divided
+
+
+def _divide_thin(obj: SeenObject) -> Iterator[np.ndarray]:
+    """Yield a label image as :func:`_divide`: 1 where wide discs lie within the object's pixels, then what is thin."""
+    mask = obj.mask_crop & np.isfinite(obj.depth_crop)
+    inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 5)
+    radius = _WIDE * float(inside.max())
+    beside = cv2.distanceTransform((inside <= radius).view(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    thin = mask & (beside > radius)
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(thin.view(np.uint8))
+    area = statistics[1:, cv2.CC_STAT_AREA]
+    is_large = area >= max(MIN_PIXELS, _LEAST_SHARE * np.count_nonzero(mask))
+    largest = 1 + np.argsort(-area, kind="stable")[: min(MOST_PARTS - 1, np.count_nonzero(is_large))]
+    number = np.zeros(count, np.int32)
+    number[largest] = np.arange(len(largest)) + 1
+    if len(largest):
+        yield np.where(mask, number[labels] + 1, 0)
 
 
 def _make_objects(obj: SeenObject, depth: np.ndarray, camera: Camera, pieces: np.ndarray) -> Iterator[SeenObject]:

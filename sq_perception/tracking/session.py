@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,8 @@ from sq_perception.tracking.state import LENGTH, Observed
 from sq_perception.tracking.tracker import Track, Tracker
 
 FIRST_FAILED_ID = 2**31
+_LOOKS_IN = 0.2
+"""Cosine between a cavity's axis and the way to the camera from which on it is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +50,8 @@ class Followed:
     superquadric: Superquadric  # a single body in the optical frame
     covariance: np.ndarray
     """(11, 11), as in :class:`~sq_perception.tracking.state.Observed`; NaN if the observation's is unknown."""
+    cavity: Any = None
+    """That of the observation, if it has one; else the one seen last, unless the camera looks into it and sees none."""
 
     @property
     def sigma_size(self) -> np.ndarray:
@@ -73,6 +78,8 @@ class TrackingSession:
         """What follows frames without a pose, by the last one known: a copy, as where their bodies are is a guess."""
         self._stamp = -np.inf
         self._pose = state.parse_pose(None)
+        self._cavities: dict[int, Any] = {}
+        """The last cavity of each track, in the frame of its body."""
         self.tally = Tally()
         """Counts after the last frame; may be read from another thread."""
         self.tracks: tuple[Track, ...] = ()
@@ -137,8 +144,25 @@ class TrackingSession:
             elif not np.isfinite(observation.covariance).all():
                 covariance = np.full((LENGTH, LENGTH), np.nan)
             body = _taper_like(body, observation.superquadric)
-            found.append(Followed(track.id, track.seen, is_fused, body, covariance))
+            cavity = self._keep_cavity(track.id, body, getattr(observation, "cavity", None))
+            found.append(Followed(track.id, track.seen, is_fused, body, covariance, cavity))
+        self._cavities = {track.id: self._cavities[track.id] for track in tracks if track.id in self._cavities}
         return tuple(found)
+
+    def _keep_cavity(self, number: int, body: Superquadric, seen: Any) -> Any:
+        """The cavity of a body as a frame shows it, or as frames before showed it, moved with the body."""
+        turn, place = body.rotation_matrix, body.translation
+        if seen is not None:
+            self._cavities[number] = replace(seen, rim=(seen.rim - place) @ turn, axis=seen.axis @ turn)
+            return seen
+        if number not in self._cavities:
+            return None
+        known = self._cavities[number]
+        known = replace(known, rim=place + turn @ known.rim, axis=turn @ known.axis)
+        if -(known.axis @ known.rim) > _LOOKS_IN * np.linalg.norm(known.rim):
+            del self._cavities[number]  # it was closed
+            return None
+        return known
 
     def _tracker_of_poses(self) -> Tracker:
         """The tracker of frames with a pose, as it was before those without one, but for what these counted."""

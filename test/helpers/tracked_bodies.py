@@ -24,6 +24,7 @@ class Seen(NamedTuple):
     repeats: int = 0
     is_predicted: bool = False
     seen: np.ndarray = np.full(3, np.nan)
+    cavity: object = None
 
 
 def nothing_but_the_covariances(patch, common, lasting):

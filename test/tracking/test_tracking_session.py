@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from tracked_bodies import Seen, angle_between, body, draw, exchanged, from_camera, looking_at, noise, spread_bodies
 
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recovery.cavities import Cavity
 from sq_perception.tracking import association, session, state
 from sq_perception.tracking.session import Tally, TrackingSession
 from sq_perception.tracking.tracker import Tracker
@@ -31,6 +33,23 @@ def test_numbers_are_those_of_the_tracks_in_the_optical_frame(rng):
     raw = [np.abs(np.log(s.superquadric.volume() / t.volume())) for s, t in zip(seen, truths, strict=True)]
     fused = [np.abs(np.log(f.superquadric.volume() / t.volume())) for f, t in zip(followed, truths, strict=True)]
     assert np.mean(fused) < np.mean(raw)
+
+
+def test_a_cavity_is_kept_while_nothing_looks_into_it_and_forgotten_when_it_is_closed():
+    truth = body()
+    axis, rim = truth.rotation_matrix[:, 2], truth.translation + 0.03 * truth.rotation_matrix[:, 2]
+    above = looking_at(truth.translation, axis, 1.0)
+    beside = looking_at(truth.translation, truth.rotation_matrix[:, 0], 1.0)
+    one, found = TrackingSession(), []
+    for k, (pose, is_shown) in enumerate([(above, True), (beside, False), (above, False), (beside, False)]):
+        matrix = quaternions.to_matrix(pose[0])
+        shown = Cavity((rim - pose[1]) @ matrix, axis @ matrix, np.array([0.04, 0.05]), 0.02, True)
+        seen = from_camera(Seen(truth, noise()), *pose)._replace(cavity=shown if is_shown else None)
+        found.append(one.follow([seen], 0.1 * k, pose)[0].cavity)
+        if k < 2:
+            np.testing.assert_allclose(found[k].rim, shown.rim, atol=1e-6)
+            np.testing.assert_allclose(found[k].axis, shown.axis, atol=1e-6)
+    assert found[2:] == [None, None]
 
 
 def test_a_body_that_tapers_does_so_in_whichever_form_it_is_seen(rng):
