@@ -1,8 +1,7 @@
 """Where a search begins: boxes around the measured points, and bodies completed by central symmetry.
 
 Boxes lie along the points' principal axes, or stand on a support plane.  The oriented box of the visible points is a
-lower bound of the body in every direction; on a plane, its height is exact as far as the top is seen.  What the camera
-does not see lies behind: where an exact body is sought, the narrow side is also tried deeper.
+lower bound of the body in every direction; on a plane, its height is exact as far as the top is seen.
 
 Central symmetry: a superquadric is its own reflection through its centre C.
 
@@ -70,22 +69,11 @@ def on_one_line(points: np.ndarray) -> bool:
     return bool(spread[1] <= 1e-6 * spread[2])
 
 
-def principal(points: np.ndarray, deeper: bool = True) -> list[State]:
-    """Boxes along the principal axes of the points, for each choice of z; deeper on the narrow side if asked for."""
+def principal(points: np.ndarray) -> list[State]:
+    """Boxes along the principal axes of the points, for each choice of z."""
     axes = principal_axes(_scatter(points))
     low, high = span(points, axes.T).T
-    found = _ordered(low, high, axes)
-    if not deeper:
-        return found
-    extents = high - low
-    thin = int(np.argmin(extents))
-    seen_from_below = points.mean(axis=0) @ axes[:, thin] > 0
-    for share in (0.5, 1.0):
-        extra = share * float(extents.max()) - extents[thin]
-        if extra > 0:
-            more = np.where(np.arange(3) == thin, extra, 0.0)
-            found += _ordered(low, high + more, axes) if seen_from_below else _ordered(low - more, high, axes)
-    return found
+    return _ordered(low, high, axes)
 
 
 def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:

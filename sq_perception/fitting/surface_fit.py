@@ -210,7 +210,7 @@ def _as_thing(task: _Task, model_error: float, starts_: list[State]) -> Solution
     if problem is None:
         return None
     points, plane = problem.observation.points, task.options.plane
-    boxes = starts.principal(points, deeper=False) if plane is None else starts.on_plane(points, plane)
+    boxes = starts.principal(points) if plane is None else starts.on_plane(points, plane)
     solution = course.thing(problem, [*starts_, *boxes])
     if problem.hull is None and not problem.late:
         solution = valleys.or_oval(valleys.weighed(solution))
