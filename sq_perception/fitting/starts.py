@@ -48,7 +48,7 @@ _MOST_PAIRS = 2500
 """Pairs that are taken, about: enough for second moments to 2 %."""
 _EIGHTH_TURN = math.pi / 4
 _EXPONENTS = (0.3, 0.8)
-"""Exponents of the last starts of all: between box and ellipsoid, nearer to either."""
+"""Exponents of the last group: between box and ellipsoid, nearer to either."""
 ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 """Which of three right-handed axes are x, y and z, so that each is z once."""
 
@@ -126,30 +126,17 @@ def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]
 
 
 def groups(observation: Observation) -> Iterator[list[State]]:
-    """Groups of starts in the order in which to try them; boxes of the points where nothing shows the symmetry."""
+    """Groups of starts in the order in which to try them, the last one of everything at once, boxes too; boxes of the
+    points alone where nothing shows the symmetry."""
     completed = completed_moments(observation)
     if completed is None:
         yield principal(observation.points)
         return
-    centre, moments = completed
-    axes = principal_axes(moments)
-    yield states(centre, moments, axes)
-    for turned in eighth_turns(axes):
-        yield states(centre, moments, turned)
-
-
-def everything(observation: Observation) -> list[State]:
-    """All starts at once, for images on which the first ones failed: boxes, and symmetry with several exponents."""
-    found = principal(observation.points)
-    completed = completed_moments(observation)
-    if completed is None:
-        return found
-    centre, moments = completed
-    axes = principal_axes(moments)
-    for exponent in _EXPONENTS:
-        for turned in [axes, *eighth_turns(axes)]:
-            found += states(centre, moments, turned, exponent)
-    return found
+    axes = principal_axes(completed[1])
+    turned = [axes, *eighth_turns(axes)]
+    yield from (states(*completed, each) for each in turned)
+    boxes = principal(observation.points)
+    yield boxes + [state for e in _EXPONENTS for each in turned for state in states(*completed, each, e)]
 
 
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
