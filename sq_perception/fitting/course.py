@@ -11,9 +11,9 @@ it is drawn to a predicted hull (:meth:`~sq_perception.fitting.priors.HullPrior.
 towards the covariance, and there rays count as fewer by the same factor once more: larger errors extend over larger
 parts, such as a neck, a spout or a dent.
 
-The outline: free rays beside the mask show where the body ends.  If the mask lost its edge (sensors lose what they see
-at grazing angles), the body covers pixels that were taken for free all around it: those are left out.  What the body
-then still covers determines the standard deviation of the outline.
+Free rays beside the mask show where the body ends.  If the mask lost its edge (sensors lose what they see at grazing
+angles), the body covers pixels that were taken for free all around it: those are left out.  What the body then still
+covers tells the outline's standard deviation.
 
 A thing is fitted as its convex hull, which encloses lids below a rim, necks and handles: points behind the surface
 count by Cauchy's loss, and space within the outline's convex hull may be empty.
@@ -47,8 +47,8 @@ from sq_perception.fitting.multistart import (
 from sq_perception.fitting.observation import BAND_PIXELS, Observation
 from sq_perception.fitting.options import MODEL_ERROR, TAPER, FitOptions, limits
 from sq_perception.fitting.priors import HullPrior
-from sq_perception.fitting.residuals import mean_loss, penetration, surface_distance
-from sq_perception.geometry.quantiles import deviation, quantile
+from sq_perception.fitting.residuals import mean_loss, penetration
+from sq_perception.geometry.quantiles import quantile
 
 INDEPENDENT, EXPLAINED = 100.0, 0.5
 """Most rays that a thing counts as, and the mean loss up to which it does: what cartons and cans leave.  Chosen on
@@ -64,11 +64,6 @@ FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
 averages out to a two hundredth.  Chosen on benchmarks/single_body."""
 _FINE_NOISE = 0.3
 """Noise, in pixel widths, that the fewest rays of the last stage average out; their number grows with its square."""
-_OUTLIER = 5.0
-"""Distance from the winner's surface, in standard deviations, beyond which object rays are dropped: noise reaches there
-once in two million.  Kept, they look like something left to explain, and other valleys are sought in vain."""
-_FEW_STEPS = 5
-"""Steps of a body once its outline is read."""
 _SHARP = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels, a
 uniform error of up to half a pixel (1 / sqrt(12))."""
@@ -168,14 +163,14 @@ def exact(problem: Problem, groups: Iterable[Callable[[], Sequence[State]]], pat
 
 
 def _on_all_rays(problem: Problem, finalists: Sequence[State]) -> Solution:
-    """The best of the finalists on all rays, but those that their favourite shows to be none of the object, or of free
-    space; the precision of its outline is read from its misfit."""
+    """The best of the finalists on all rays, enough that the noise of their mean is well below a pixel's width; the
+    precision of the outline is read from the misfit of their favourite."""
     favourite, *others = finalists
     if not problem.late:
         problem, favourite = without_shrunk_edge(problem, favourite)
-    enough = _enough_rays(problem.observation)
+    ratio = problem.observation.sigma / problem.observation.footprint
+    enough = int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
     rays = problem.draw(problem.options.pixels or enough, 0.3)
-    rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
     few = problem.draw(enough // 4, 0.3)
     problem, favourite = sharpened(problem, favourite, rays.free, few)
     settled = by_cost(problem.settle(state, few) for state in [favourite, *others])
@@ -183,19 +178,6 @@ def _on_all_rays(problem: Problem, finalists: Sequence[State]) -> Solution:
     near = [state for state in settled if state.cost <= settled[0].cost + SLACK]
     refined = by_cost(problem.refine(state, rays) for state in (near[:1] if problem.late else near))
     return Solution(problem, refined[0], rays)
-
-
-def _enough_rays(observation: Observation) -> int:
-    """Number of rays that bring the noise of their mean well below a pixel's width."""
-    ratio = observation.sigma / observation.footprint
-    return int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
-
-
-def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
-    """The rays (k, 7) whose points lie near the surface, measured by the typical distance of all."""
-    distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
-    spread = max(observation.sigma, deviation(distance))
-    return hits[distance < _OUTLIER * spread]
 
 
 def thing(problem: Problem, starts: Sequence[State]) -> Solution:
@@ -262,27 +244,14 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
 
     The precision does not fall: else pixels that miss a body would cost next to nothing, and it might leave them.
     """
-    state, sigma = _pulled_in(problem, state, free, rays)
-    before = math.inf
+    before, sigma = math.inf, _outline_sigma(problem, state, free)
     while True:
         sigma = min(sigma, problem.observation.outline)
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
-        state = problem.settle(state, rays, _FEW_STEPS)
+        state = problem.settle(state, rays)
         before, sigma = sigma, _outline_sigma(problem, state, free)
-
-
-def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
-    """The body, refitted with its outline known to a pixel if it sticks out farther than assumed and that helps; and
-    how far the one returned sticks out, metres."""
-    sigma = _outline_sigma(problem, state, free)
-    if not sigma > problem.observation.outline or problem.late:
-        return state, sigma
-    pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
-    other = pixel.settle(state, rays)
-    nearer = _outline_sigma(problem, other, free)
-    return (other, nearer) if nearer < _SHARPER * sigma else (state, sigma)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:

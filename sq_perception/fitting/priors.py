@@ -226,44 +226,39 @@ def _hull_rows(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np
 @kernel
 def _proportion_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
     mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
-    cost = 0.0
-    row = np.zeros(STEP_LENGTH + 1)
+    cost, square = 0.0, terms.proportion_stiffness * terms.proportion_stiffness
     for k in range(3):
-        row[:] = 0.0
-        for j in range(3):
-            row[j] = terms.proportion_stiffness * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
-        residual = terms.proportion_stiffness * (math.log(parameters[k]) - mean)
-        row[STEP_LENGTH] = residual
-        cost += residual * residual
-        add_row(row, sums)
+        apart = math.log(parameters[k]) - mean
+        cost += square * apart * apart
+        sums[STEP_LENGTH, k] += square * apart
+        for j in range(k + 1):
+            sums[k, j] += square * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
     return cost
 
 
 @kernel
 def _expectation_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
-    cost = 0.0
-    row = np.zeros(STEP_LENGTH + 1)
+    cost, s = 0.0, terms.expectation_stiffness
     for k in range(3):
-        residual = terms.expectation_stiffness * math.log(parameters[k] / terms.expected[k])
-        scale = 1.0 / math.sqrt(1.0 + residual * residual)
-        cost += math.log1p(residual * residual)
-        row[:] = 0.0
-        row[k] = scale * terms.expectation_stiffness
-        row[STEP_LENGTH] = scale * residual
-        add_row(row, sums)
+        residual = s * math.log(parameters[k] / terms.expected[k])
+        above = 1.0 + residual * residual
+        cost += math.log(above)
+        sums[k, k] += s * s / above
+        sums[STEP_LENGTH, k] += s * residual / above
     return cost
 
 
 @kernel
 def _roundness_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
     s = terms.roundness_stiffness
-    oval = s * (math.log(parameters[0]) - math.log(parameters[1]))
-    square = s * (1.0 - parameters[4])
+    oval, square = s * math.log(parameters[0] / parameters[1]), s * (1.0 - parameters[4])
     above = 1.0 + oval * oval + square * square
-    scale = math.sqrt(3.0 / above)
-    row = np.zeros(STEP_LENGTH + 1)
-    row[0], row[1], row[STEP_LENGTH] = scale * s, -scale * s, scale * oval
-    add_row(row, sums)
-    row[0], row[1], row[4], row[STEP_LENGTH] = 0.0, 0.0, -scale * s, scale * square
-    add_row(row, sums)
+    slope = 3.0 * s / above
+    sums[0, 0] += s * slope
+    sums[1, 0] -= s * slope
+    sums[1, 1] += s * slope
+    sums[4, 4] += s * slope
+    sums[STEP_LENGTH, 0] += slope * oval
+    sums[STEP_LENGTH, 1] -= slope * oval
+    sums[STEP_LENGTH, 4] -= slope * square
     return 3.0 * math.log(above)

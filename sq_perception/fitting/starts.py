@@ -1,8 +1,7 @@
 """Where a search begins: boxes around the measured points, and bodies completed by central symmetry.
 
 Boxes lie along the points' principal axes, or stand on a support plane.  The oriented box of the visible points is a
-lower bound of the body in every direction; on a plane, its height is exact as far as the top is seen.  What the camera
-does not see lies behind: where an exact body is sought, the narrow side is also tried deeper.
+lower bound of the body in every direction; on a plane, its height is exact as far as the top is seen.
 
 Central symmetry: a superquadric is its own reflection through its centre C.
 
@@ -49,7 +48,7 @@ _MOST_PAIRS = 2500
 """Pairs that are taken, about: enough for second moments to 2 %."""
 _EIGHTH_TURN = math.pi / 4
 _EXPONENTS = (0.3, 0.8)
-"""Exponents of the last starts of all: between box and ellipsoid, nearer to either."""
+"""Exponents of the last group: between box and ellipsoid, nearer to either."""
 ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 """Which of three right-handed axes are x, y and z, so that each is z once."""
 
@@ -70,22 +69,11 @@ def on_one_line(points: np.ndarray) -> bool:
     return bool(spread[1] <= 1e-6 * spread[2])
 
 
-def principal(points: np.ndarray, deeper: bool = True) -> list[State]:
-    """Boxes along the principal axes of the points, for each choice of z; deeper on the narrow side if asked for."""
+def principal(points: np.ndarray) -> list[State]:
+    """Boxes along the principal axes of the points, for each choice of z."""
     axes = principal_axes(_scatter(points))
     low, high = span(points, axes.T).T
-    found = _ordered(low, high, axes)
-    if not deeper:
-        return found
-    extents = high - low
-    thin = int(np.argmin(extents))
-    seen_from_below = points.mean(axis=0) @ axes[:, thin] > 0
-    for share in (0.5, 1.0):
-        extra = share * float(extents.max()) - extents[thin]
-        if extra > 0:
-            more = np.where(np.arange(3) == thin, extra, 0.0)
-            found += _ordered(low, high + more, axes) if seen_from_below else _ordered(low - more, high, axes)
-    return found
+    return _ordered(low, high, axes)
 
 
 def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
@@ -138,30 +126,17 @@ def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]
 
 
 def groups(observation: Observation) -> Iterator[list[State]]:
-    """Groups of starts in the order in which to try them; boxes of the points where nothing shows the symmetry."""
+    """Groups of starts in the order in which to try them, the last one of everything at once, boxes too; boxes of the
+    points alone where nothing shows the symmetry."""
     completed = completed_moments(observation)
     if completed is None:
         yield principal(observation.points)
         return
-    centre, moments = completed
-    axes = principal_axes(moments)
-    yield states(centre, moments, axes)
-    for turned in eighth_turns(axes):
-        yield states(centre, moments, turned)
-
-
-def everything(observation: Observation) -> list[State]:
-    """All starts at once, for images on which the first ones failed: boxes, and symmetry with several exponents."""
-    found = principal(observation.points)
-    completed = completed_moments(observation)
-    if completed is None:
-        return found
-    centre, moments = completed
-    axes = principal_axes(moments)
-    for exponent in _EXPONENTS:
-        for turned in [axes, *eighth_turns(axes)]:
-            found += states(centre, moments, turned, exponent)
-    return found
+    axes = principal_axes(completed[1])
+    turned = [axes, *eighth_turns(axes)]
+    yield from (states(*completed, each) for each in turned)
+    boxes = principal(observation.points)
+    yield boxes + [state for e in _EXPONENTS for each in turned for state in states(*completed, each, e)]
 
 
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:

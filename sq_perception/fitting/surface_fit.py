@@ -113,7 +113,8 @@ def fit(
     crop = Crop.around(depth, mask, camera, options.noise)
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
-    task = _Task(depth, mask, camera, crop, options, given, later, began)
+    fills_image = fills(box(mask), np.isfinite(depth) & (depth > 0))
+    task = _Task(crop, fills_image, options, given, later, began)
     solution = _solved(task)
     if solution is None:
         observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
@@ -124,24 +125,11 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """An object to fit.
+    """An object to fit: the image near it, and whether it is all that was measured, as the unit cube's bodies and walls
+    before a camera are; the caller's starts, ``later`` those that cost time; when the fit began."""
 
-    Attributes
-    ----------
-    depth, mask, camera
-    crop
-        The part of these images that is near the object.
-    options
-    given, later
-        The caller's starts; ``later`` returns those that cost time.
-    began
-        When the fit began, by :func:`time.perf_counter`.
-    """
-
-    depth: np.ndarray
-    mask: np.ndarray
-    camera: Camera
     crop: Crop
+    fills_image: bool
     options: FitOptions
     given: list[State]
     later: Callable[[], list[State]] | None
@@ -154,7 +142,7 @@ class _Task:
         """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
         if self.options.plane is not None:
             return True
-        return self.camera.is_pinhole and not self.fills_image and self.options.predicted_hull() is not None
+        return self.crop.camera.is_pinhole and not self.fills_image and self.options.predicted_hull() is not None
 
     @cached_property
     def model_error(self) -> float:
@@ -165,11 +153,6 @@ class _Task:
     def is_fine(self) -> bool:
         """Whether the noise is too small to hide how far things stray."""
         return self.crop.noise.sigma < _FINE_NOISE * self.model_error
-
-    @cached_property
-    def fills_image(self) -> bool:
-        """Whether the object is all that was measured, as the unit cube's bodies and walls before a camera are."""
-        return fills(box(self.mask), np.isfinite(self.depth) & (self.depth > 0))
 
     def problem(self, model_error: float) -> Problem | None:
         """The problem of an object that strays so far; None if no body can be fitted to it."""
@@ -197,7 +180,7 @@ def _solved(task: _Task) -> Solution | None:
     exactly = _exactly(task, [])
     if exactly is None or exactly.problem.late:
         return exactly
-    may_stray = task.camera.is_pinhole and not task.is_fine and not task.fills_image
+    may_stray = task.crop.camera.is_pinhole and not task.is_fine and not task.fills_image
     if exactly.misfit < (_NOISE_ALONE if may_stray else course.EXPLAINS):
         return exactly.noted(spread_factor=course.SPREAD) if may_stray else exactly
     left = deviation(np.abs(exactly.distances))
@@ -210,7 +193,7 @@ def _as_thing(task: _Task, model_error: float, starts_: list[State]) -> Solution
     if problem is None:
         return None
     points, plane = problem.observation.points, task.options.plane
-    boxes = starts.principal(points, deeper=False) if plane is None else starts.on_plane(points, plane)
+    boxes = starts.principal(points) if plane is None else starts.on_plane(points, plane)
     solution = course.thing(problem, [*starts_, *boxes])
     if problem.hull is None and not problem.late:
         solution = valleys.or_oval(valleys.weighed(solution))
@@ -229,8 +212,7 @@ def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution 
     if task.later is not None:
         groups.append(task.later)
     if patient:
-        groups += [lambda: next(symmetric, [])] * 3
-        groups.append(lambda: starts.everything(observation))
+        groups += [lambda: next(symmetric, [])] * 4
     solution = course.exact(problem, groups, patient)
     if solution is None:
         return None

@@ -33,7 +33,6 @@ from sq_perception.fitting.multistart import SETTLE, SIGNIFICANT, SLACK, Problem
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.quality import Alternative, undetermined
 from sq_perception.fitting.starts import resized
-from sq_perception.geometry.kernels import kernel
 
 _SETTLED, _UNSURE = 1.03, 0.01
 """Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
@@ -44,10 +43,6 @@ _FACE_SHARE = 0.04
 """Share of all rays that have a depth in common, from which on it is that of a face."""
 _DEAD_ZONE = 0.5 * 1.01
 """Residual, in steps, up to which it counts as 0: half a step, and a little for single precision."""
-_CONTRADICTED = 0.003
-"""Mean squared residual beyond half a step, in units of the noise, above which a body is wrong.  Of 1000 of the thesis'
-images all but one leave 0.0007 at most; a body 3 % too long left 0.01, its mean squared residual was 0.85, the right
-one's 0.76."""
 _RAYS = 1000
 """Rays of a question to a body at hand, and of the search for each body of a walk, which begins at a neighbour's."""
 _PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
@@ -84,7 +79,7 @@ def explored(solution: Solution) -> Solution:
     found: list[State] = []
     while True:
         best = solution.state
-        unexplained = solution.misfit > _SETTLED or _contradicts(solution)
+        unexplained = solution.misfit > _SETTLED
         unsure = solution.unsure()
         if solution.problem.late or not (unexplained or unsure.max() > _UNSURE):
             break
@@ -176,18 +171,6 @@ def or_oval(solution: Solution) -> Solution:
     dearer = problem.settle(oval.state, rays, 0).cost - problem.settle(solution.state, rays, 0).cost
     share = _OVAL / (_OVAL + (1 - _OVAL) * math.exp(0.5 * max(dearer, 0.0)))
     return solution.noted(alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
-
-
-def _contradicts(solution: Solution) -> bool:
-    """Whether the body passes rounded readings at more than half a step, as the true one does not.
-
-    The sum of squares hardly shows it: below half a step a residual is the rounding's, and says nothing.
-    """
-    if solution.problem.observation.noise.quantum == 0.0:
-        return False
-    rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
-    left = _rounded(solution.problem).refine(solution.state, rays, steps=0)
-    return left.cost > _CONTRADICTED * rays.weight
 
 
 def _rounded(problem: Problem) -> Problem:
@@ -315,7 +298,13 @@ def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, 
 
     They end at the image's border, or at a band without readings along it: of a rectified image, of a stereo camera.
     """
-    left, top, right, bottom, cut = _borders(observation.depth, observation.mask, observation.free)
+    known = np.isfinite(observation.depth)
+    known.flat[observation.free] = True  # some are known to be empty without a reading
+    (left, right), (top, bottom) = _ends(known), _ends(known.T)
+    rows, columns = np.flatnonzero(right >= 0), np.flatnonzero(bottom >= 0)
+    firsts, lasts = (rows, left[rows]), (rows, right[rows])
+    sides = [firsts, (top[columns], columns), lasts, (bottom[columns], columns)]
+    cut = np.array([observation.mask[side].any() for side in sides])
     if not cut.any():
         return
     camera = observation.camera
@@ -329,34 +318,11 @@ def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, 
                 yield axis, sign
 
 
-@kernel
-def _borders(
-    depth: np.ndarray, mask: np.ndarray, free: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """First reading of each row (h,) and column (w,), the last ones, and on which of these sides (4,) the object has
-    any of them.  Free pixels, indices into the image (h, w), count as readings: some are known to be empty without one.
-    """
-    height, width = depth.shape
-    known = np.isfinite(depth)
-    for pixel in free:
-        known[pixel // width, pixel % width] = True
-    left, right = np.full(height, width), np.full(height, -1)
-    top, bottom = np.full(width, height), np.full(width, -1)
-    for v in range(height):
-        for u in range(width):
-            if known[v, u]:
-                left[v], right[v] = min(left[v], u), u
-                top[u], bottom[u] = min(top[u], v), v
-    cut = np.zeros(4, np.bool_)
-    for v in range(height):
-        if right[v] >= 0:
-            cut[0] |= mask[v, left[v]]
-            cut[2] |= mask[v, right[v]]
-    for u in range(width):
-        if bottom[u] >= 0:
-            cut[1] |= mask[top[u], u]
-            cut[3] |= mask[bottom[u], u]
-    return left, top, right, bottom, cut
+def _ends(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first and the last set pixel of each row (h,); beyond either border where none is."""
+    any_, width = known.any(axis=1), known.shape[1]
+    last = width - 1 - known[:, ::-1].argmax(axis=1)
+    return np.where(any_, known.argmax(axis=1), width), np.where(any_, last, -1)
 
 
 def _longer(state: State, axis: int, sign: float, size: float) -> State:

@@ -11,13 +11,14 @@ import numpy as np
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.cost import SAMPLE
 from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.observation import BAND_PIXELS
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, PlaneError
 from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.recovery.seen_object import SeenObject, surroundings
 
 _SCORE_STRIDE = 3
 """22 x 22 lines of sight of 64 voxels settle a score to a hundredth."""
@@ -65,11 +66,13 @@ def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitO
 
     A prediction may be computed only when the fit asks for it, which it need not do for images without noise.
     """
+    # As much of the image as the fit looks at, and more.
+    _, near, mask, view = surroundings(obj, depth, obj.mask, camera, max(obj.mask_crop.shape) + BAND_PIXELS)
     if obj.prediction is None:
-        return surface_fit.fit(depth, obj.mask, camera, options=known)
+        return surface_fit.fit(near, mask, view, options=known)
     predicted = obj.prediction.body
     options = replace(known, expected=predicted, hull=obj.prediction.hull)
-    return surface_fit.fit(depth, obj.mask, camera, start=predicted, options=options)
+    return surface_fit.fit(near, mask, view, start=predicted, options=options)
 
 
 def widened(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:

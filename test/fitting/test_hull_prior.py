@@ -194,7 +194,7 @@ def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
     shown, _ = raycast.render(body, CAMERA)
     dents = 0.004 * np.sin(np.linspace(0, 40, shown.shape[1]))[None]
     depth = np.where(mask, shown + dents, 1.5).astype(np.float32)
-    monkeypatch.setattr(surface_fit.starts, "everything", None)
+    monkeypatch.setattr(surface_fit.starts, "_EXPONENTS", None)
     found = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(hull=told(body, 0.004)))
     ahead = np.array([[0.0, 0.0, 1.0]])
     far = found.superquadric.translation[2] + found.superquadric.support(ahead)[0]
