@@ -51,7 +51,7 @@ def cameras() -> dict[str, Draw]:
 
 def views_of(draw: Draw, count: int, seed: int) -> ThingViews:
     """Draw views, each from a generator of its own: what one takes changes no other."""
-    with patch.object(thing_views, "draw_stages", draw):
+    with patch.multiple(thing_views, draw_stages=draw, PROCESSED=1.0):
         drawn = [draw_thing_views(1, np.random.default_rng([seed, k])) for k in range(count)]
     names = [field.name for field in fields(ThingViews)]
     return ThingViews(*(np.concatenate([getattr(one, name) for one in drawn]) for name in names))

@@ -41,6 +41,8 @@ from sq_perception.simulation.thing_setting import Setting, draw_setting
 
 _PIXELS = 64
 """Side of the views: what the network of objects takes."""
+PROCESSED = 0.5
+"""Share of the views whose depth passes through random stages after the sensor; few drawn cameras have none at all."""
 _LEAST_SEEN = 40
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
 
@@ -84,7 +86,7 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
     for _ in range(attempts):
         thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < 0.5 else draw_thing(rng)
         setting = draw_setting(thing, rng)
-        stages = draw_stages(rng)
+        stages = draw_stages(rng) if rng.random() < PROCESSED else Stages()
         measured, seen, camera = _measure(setting, stages, rng)
         plane = None
         # Of an object on top of something the plane is that top as often as recovery finds it.  Else the object hovers

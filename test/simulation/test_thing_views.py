@@ -52,7 +52,8 @@ def test_views_look_as_promised() -> None:
     assert views.planes.dtype == views.support.dtype == np.float32
     hidden = (views.images <= HIDDEN) & (views.images > COVERED)
     assert ((views.images >= FLUSH) | (hidden & (views.images >= 2 * HIDDEN)) | (views.images == COVERED)).all()
-    assert 0.3 < (views.images == COVERED).any(axis=(1, 2)).mean() < 0.7  # half of the masks cover what is not measured
+    # Half of the masks cover what is not measured; in a part of the views all is measured.
+    assert 0.15 < (views.images == COVERED).any(axis=(1, 2)).mean() < 0.5
     assert (views.images <= 1).all()
     assert (views.images > 0).any(axis=(1, 2)).all()
     assert hidden.any(axis=(1, 2)).mean() > 0.5
