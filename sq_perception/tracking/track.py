@@ -91,6 +91,7 @@ class Body:
     follows: bool = True  # whether the state is as the last observation has it
     answer: np.ndarray | None = None
     """(12,), the last observation, if it is an old answer that shows no more than that the body is still there."""
+    at_rest: np.ndarray | None = None  # its covariance if it has not moved, while it may be anywhere within reach
 
     @property
     def is_moving(self) -> bool:
@@ -108,8 +109,10 @@ class Body:
             state[5:8] += step
             variance[CENTRE] += step @ step  # hands speed up and stop
             variance[TURN] += HAND**2 * min(elapsed, 1.0)
+        at_rest = None
         # Seconds without observation until a body may be anywhere within reach. Chosen.
         if stamp - self.last > 5.0:
+            at_rest = (estimate.covariance if self.at_rest is None else self.at_rest) + np.diag(variance)
             # Once: however many frames pass meanwhile, it cannot be forgotten more.
             variance[POSE] += np.maximum(HAND**2 - np.diag(estimate.covariance)[POSE], 0.0)
         return replace(
@@ -118,12 +121,17 @@ class Body:
             velocity=velocity,
             observation=None,
             answer=self.answer if self.observation is not None else None,
+            at_rest=at_rest,
         )
 
     def see_again(self, index: int, answer: np.ndarray, stamp: float) -> Body:
         """The body after an old answer, the observation of this index."""
         agreed = stamp if self.follows else self.agreed
-        return replace(self, seen=self.seen + 1, missed=0, last=stamp, agreed=agreed, observation=index, answer=answer)
+        estimate = self.estimate if self.at_rest is None else self.estimate._replace(covariance=self.at_rest)
+        return replace(
+            self, estimate=estimate, seen=self.seen + 1, missed=0, last=stamp, agreed=agreed, observation=index,
+            answer=answer,
+        )
 
     def publish(self) -> Track:
         """What a consumer gets."""

@@ -115,6 +115,15 @@ def test_an_old_answer_counts_where_the_camera_was_corrected(rng):
     assert found.id == 1
 
 
+def test_an_old_answer_counts_after_a_pause(rng):
+    """As when an arm was at work for some seconds: the pose was forgotten, and the image shows where the body is."""
+    one, seen = TrackingSession(), draw(body(), noise(), rng)
+    before, _, after = (one.follow([seen._replace(repeats=k)], stamp)[0] for k, stamp in enumerate((0.0, 0.2, 8.0)))
+    known = [np.sqrt(np.diag(each.covariance)) for each in (before, after)]
+    assert (known[1] > known[0] - 1e-9).all(), "an old answer says nothing new"
+    assert (known[1][5:8] < 0.1).all()
+
+
 def test_a_body_exchanged_for_another_is_published_late_by_one_frame_at_most(rng):
     """The same place and pose, other sizes: one such frame may be an error, the second one is believed."""
     one, old, new = TrackingSession(), body((0.05, 0.04, 0.03)), body((0.05, 0.04, 0.06))
