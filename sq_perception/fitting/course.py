@@ -244,7 +244,8 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
 
     The precision does not fall: else pixels that miss a body would cost next to nothing, and it might leave them.
     """
-    before, sigma = math.inf, _outline_sigma(problem, state, free)
+    state, sigma = _pulled_in(problem, state, free, rays)
+    before = math.inf
     while True:
         sigma = min(sigma, problem.observation.outline)
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
@@ -252,6 +253,18 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
         problem = problem.with_terms(outline_stiffness=1 / sigma)
         state = problem.settle(state, rays)
         before, sigma = sigma, _outline_sigma(problem, state, free)
+
+
+def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
+    """The body, refitted with its outline known to a pixel if it sticks out farther than assumed and that helps; and
+    how far the one returned sticks out, metres."""
+    sigma = _outline_sigma(problem, state, free)
+    if not sigma > problem.observation.outline or problem.late:
+        return state, sigma
+    pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
+    other = pixel.settle(state, rays)
+    nearer = _outline_sigma(problem, other, free)
+    return (other, nearer) if nearer < _SHARPER * sigma else (state, sigma)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
