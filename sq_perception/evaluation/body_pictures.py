@@ -27,17 +27,9 @@ _LIGHT = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
 
 
 def draw_bodies_3d(
-    ax: Axes,
-    bodies: Sequence[Superquadric],
-    points: Sequence[np.ndarray] | None = None,
-    plane: np.ndarray | None = None,
-    colours: Sequence[Any] | None = None,
-    *,
-    elevation: float = 20.0,
-    azimuth: float = 30.0,
-    unit: str = "m",
-    pixels: int = 560,
-    wires: Sequence[np.ndarray] = (),
+    ax: Axes, bodies: Sequence[Superquadric], points: Sequence[np.ndarray] | None = None,
+    plane: np.ndarray | None = None, colours: Sequence[Any] | None = None, *, elevation: float = 20.0,
+    azimuth: float = 30.0, unit: str = "m", pixels: int = 560, wires: Sequence[np.ndarray] = (),
 ) -> None:
     """Shaded picture of bodies of the optical frame from another place, exact as the depth images are.
 

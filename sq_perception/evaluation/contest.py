@@ -139,12 +139,8 @@ def network(path: Path, name: str | None = None) -> Contestant:
     if loss == "mse":
         parts.append("the rotation was not learned")
     return Contestant(
-        name or default_name(path),
-        ", ".join(parts),
-        loss,
-        partial(_predict, model, Recoverer(path, method="network")),
-        training.get("canonical_labels", False),
-        {"model": str(path), "training": training, "metrics": metrics},
+        name or default_name(path), ", ".join(parts), loss, partial(_predict, model, Recoverer(path, method="network")),
+        training.get("canonical_labels", False), {"model": str(path), "training": training, "metrics": metrics},
     )
 
 
@@ -196,8 +192,7 @@ class Outcome:
 
 
 def compare(
-    contestants: Sequence[tuple[Contestant, int]],
-    images: ThesisImages,
+    contestants: Sequence[tuple[Contestant, int]], images: ThesisImages,
     advance: Callable[[str, int], None] | None = None,
 ) -> list[Outcome]:
     """Have every contestant recover the first bodies of the test set.

@@ -66,10 +66,7 @@ class FiguresOfMerit:
 
     @classmethod
     def of(
-        cls,
-        prediction: Superquadric,
-        truth: Superquadric,
-        recovered: np.ndarray | None = None,
+        cls, prediction: Superquadric, truth: Superquadric, recovered: np.ndarray | None = None,
         milliseconds: np.ndarray | None = None,
     ) -> FiguresOfMerit:
         """Compare batches (n,) of the cube frame.
@@ -91,13 +88,10 @@ class FiguresOfMerit:
         return cls(
             np.where(missing, 0.0, metrics.thesis_iou(prediction, truth)),
             np.where(missing, 0.0, metrics.volume_iou(prediction, truth)),
-            known(metrics.volume_error(prediction, truth)),
-            known(metrics.shape_error(prediction, truth)),
+            known(metrics.volume_error(prediction, truth)), known(metrics.shape_error(prediction, truth)),
             known(metrics.translation_error(prediction, truth)),
-            known(shortest_arc(prediction.rotation, truth.rotation)),
-            known(angles[0, :4].min(axis=0)),
-            known(angles[0].min(axis=0)),
-            known(angles.min(axis=(0, 1))),
+            known(shortest_arc(prediction.rotation, truth.rotation)), known(angles[0, :4].min(axis=0)),
+            known(angles[0].min(axis=0)), known(angles.min(axis=(0, 1))),
             np.full(count, np.nan) if milliseconds is None else np.asarray(milliseconds, dtype=float),
         )
 

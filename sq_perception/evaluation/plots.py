@@ -77,11 +77,7 @@ def draw_masks(ax: Axes, labels: np.ndarray, ids: Sequence[int], opacity: float 
 
 
 def draw_outlines(
-    ax: Axes,
-    bodies: Sequence[Superquadric],
-    camera: Camera,
-    colours: Sequence[Any] | None = None,
-    width: float = 2.2,
+    ax: Axes, bodies: Sequence[Superquadric], camera: Camera, colours: Sequence[Any] | None = None, width: float = 2.2,
     edges: bool = True,
 ) -> None:
     """Reproject bodies: silhouettes, visible edges thin, hidden edges dotted."""
@@ -105,14 +101,8 @@ def draw_outlines(
 
 
 def draw_grasps(
-    ax: Axes,
-    depth: np.ndarray,
-    camera: Camera,
-    bodies: Sequence[Superquadric],
-    plan: GraspPlan,
-    hand: Gripper,
-    numbers: Sequence[int] | None = None,
-    window: Window | None = None,
+    ax: Axes, depth: np.ndarray, camera: Camera, bodies: Sequence[Superquadric], plan: GraspPlan, hand: Gripper,
+    numbers: Sequence[int] | None = None, window: Window | None = None,
 ) -> None:
     """A depth image, the outlines of its bodies and, at the best grasp of each, the gripper with its probability.
 

@@ -98,19 +98,14 @@ def problem_of(observation: Observation, options: FitOptions, deadline: float) -
     plane, model_error = options.plane, observation.model_error
     hull = options.predicted_hull() if model_error else None
     terms = Terms(
-        hit_tolerance=_HIT_TOLERANCE,
-        pinhole=1.0 if observation.camera.is_pinhole else 0.0,
-        outline_stiffness=1 / observation.outline,
-        proportion_stiffness=1 / _PROPORTION_SIGMA,
+        hit_tolerance=_HIT_TOLERANCE, pinhole=1.0 if observation.camera.is_pinhole else 0.0,
+        outline_stiffness=1 / observation.outline, proportion_stiffness=1 / _PROPORTION_SIGMA,
     )
     if plane is not None:
         scale = min((model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
         terms = terms._replace(
-            plane=plane,
-            plane_stiffness=1 / (_PLANE_SIGMA * scale),
-            gap_stiffness=1 / (_GAP_SIGMA * scale),
-            rest_stiffness=1 / _REST_SIGMA,
-            volume_price=_VOLUME_PRICE,
+            plane=plane, plane_stiffness=1 / (_PLANE_SIGMA * scale), gap_stiffness=1 / (_GAP_SIGMA * scale),
+            rest_stiffness=1 / _REST_SIGMA, volume_price=_VOLUME_PRICE,
         )
     if model_error:
         observation = observation.of_hull()

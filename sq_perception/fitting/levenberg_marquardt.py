@@ -60,14 +60,8 @@ class State(NamedTuple):
 
 @kernel
 def minimize(
-    stage: int,
-    rays: np.ndarray,
-    free: np.ndarray,
-    terms: Terms,
-    start: State,
-    limits: tuple[np.ndarray, np.ndarray],
-    max_iterations: int,
-    tolerance: float,
+    stage: int, rays: np.ndarray, free: np.ndarray, terms: Terms, start: State, limits: tuple[np.ndarray, np.ndarray],
+    max_iterations: int, tolerance: float,
 ) -> State:
     """The best body found from ``start`` in at most ``max_iterations`` steps.
 
@@ -173,13 +167,8 @@ def solve_damped(sums: np.ndarray, damping: float, held: np.ndarray, factor: np.
 
 @kernel
 def move(
-    parameters: np.ndarray,
-    rotation: np.ndarray,
-    step: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    next_parameters: np.ndarray,
-    next_rotation: np.ndarray,
+    parameters: np.ndarray, rotation: np.ndarray, step: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    next_parameters: np.ndarray, next_rotation: np.ndarray,
 ) -> None:
     """Apply a clipped step: sizes multiply, shape, centre and taper add, the rotation turns about its own axes."""
     largest_size = max(parameters[0], parameters[1], parameters[2])

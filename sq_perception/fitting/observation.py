@@ -151,13 +151,8 @@ class Crop:
         shown = drawn(pixels, areas, _POINTS, 0.5)
         v, u = np.divmod(shown, self.camera.width)
         return Observation(
-            **{**vars(self), "mask": filled.view(bool)},
-            pixels=pixels,
-            areas=areas,
-            free=free,
-            free_pixels=free_pixels,
-            model_error=model_error,
-            points=np.asfortranarray(self.camera.unproject(u, v, self.depth.ravel()[shown])),
+            **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, areas=areas, free=free, free_pixels=free_pixels,
+            model_error=model_error, points=np.asfortranarray(self.camera.unproject(u, v, self.depth.ravel()[shown])),
         )
 
     def _coherent(self, jump: float, plane: np.ndarray | None) -> np.ndarray:
@@ -284,12 +279,7 @@ def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
 
 @kernel
 def _sort(
-    depth: np.ndarray,
-    inside: np.ndarray,
-    claimed: np.ndarray,
-    near: np.ndarray,
-    lost: np.ndarray,
-    footprint: float,
+    depth: np.ndarray, inside: np.ndarray, claimed: np.ndarray, near: np.ndarray, lost: np.ndarray, footprint: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Object pixels, their areas, free pixels, and how many pixels the free ones stand for.
 

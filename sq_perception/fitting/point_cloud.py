@@ -110,11 +110,8 @@ class UnitCloud:
     def body(self, numbers: np.ndarray, turn: np.ndarray) -> Superquadric:
         """A body (10,) with its rotation (3, 3) in the frame of the user."""
         return Superquadric(
-            numbers[0:3] * self.scale,
-            numbers[3:5],
-            self.centre + self.scale * (self.axes @ numbers[5:8]),
-            quaternions.from_matrix(self.axes @ turn),
-            numbers[8:10],
+            numbers[0:3] * self.scale, numbers[3:5], self.centre + self.scale * (self.axes @ numbers[5:8]),
+            quaternions.from_matrix(self.axes @ turn), numbers[8:10],
         )
 
 

@@ -121,14 +121,8 @@ def _rows(points: np.ndarray, first: int, body: np.ndarray, m: np.ndarray, rows:
 
 @kernel
 def normal_equations(
-    points: np.ndarray,
-    offsets: np.ndarray,
-    sides: np.ndarray,
-    weights: np.ndarray,
-    body: np.ndarray,
-    m: np.ndarray,
-    prior: Prior,
-    sums: np.ndarray,
+    points: np.ndarray, offsets: np.ndarray, sides: np.ndarray, weights: np.ndarray, body: np.ndarray, m: np.ndarray,
+    prior: Prior, sums: np.ndarray,
 ) -> float:
     """Sum of weights times squared residuals and prior; fills ``sums`` (14, 14): J^T J, and J^T r in the last row.
 
@@ -172,15 +166,8 @@ def normal_equations(
 
 @kernel
 def improve(
-    points: np.ndarray,
-    offsets: np.ndarray,
-    sides: np.ndarray,
-    weights: np.ndarray,
-    body: np.ndarray,
-    m: np.ndarray,
-    prior: Prior,
-    steps: int,
-    tolerance: float,
+    points: np.ndarray, offsets: np.ndarray, sides: np.ndarray, weights: np.ndarray, body: np.ndarray, m: np.ndarray,
+    prior: Prior, steps: int, tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """The body after up to so many Levenberg-Marquardt steps, its rotation, and the cost; it never rises."""
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))

@@ -68,12 +68,8 @@ _ONE_SIDED = 0.75
 
 
 def fit_points(
-    points: np.ndarray,
-    normals: np.ndarray | None = None,
-    *,
-    taper: bool = True,
-    outliers: float | Literal["auto"] = "auto",
-    sigma: float | None = None,
+    points: np.ndarray, normals: np.ndarray | None = None, *, taper: bool = True,
+    outliers: float | Literal["auto"] = "auto", sigma: float | None = None,
 ) -> Fit:
     """Fit one superquadric to points (n, 3) of an object's surface, from all sides or some.
 
@@ -267,14 +263,9 @@ def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: 
         message = "; ".join([message, *notes])
     return Fit(
         superquadric=canonical,
-        residual=float(np.sqrt(np.sum(weight * off**2) / max(weight.sum(), 1e-9))) * cloud.scale,
-        status=status,
-        message=message,
-        noise=sigma,
-        inlier_share=float(weight.mean()),
-        seen=seen_extents(canonical, own) if len(own) else np.zeros(3),
-        covariance=covariance,
-        iterations=0,
+        residual=float(np.sqrt(np.sum(weight * off**2) / max(weight.sum(), 1e-9))) * cloud.scale, status=status,
+        message=message, noise=sigma, inlier_share=float(weight.mean()),
+        seen=seen_extents(canonical, own) if len(own) else np.zeros(3), covariance=covariance, iterations=0,
         milliseconds=(time.perf_counter() - began) * 1e3,
     )
 

@@ -242,13 +242,8 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
     points = observation.points
     distance = np.abs(body.sampson_distance(points))
     return Fit(
-        superquadric=body.canonical_form(),
-        residual=float(np.sqrt(np.mean(distance**2))),
-        status=Status.FAILED,
-        message=reason,
-        noise=observation.sigma,
-        inlier_share=0.0,
-        milliseconds=(time.perf_counter() - began) * 1e3,
+        superquadric=body.canonical_form(), residual=float(np.sqrt(np.mean(distance**2))), status=Status.FAILED,
+        message=reason, noise=observation.sigma, inlier_share=0.0, milliseconds=(time.perf_counter() - began) * 1e3,
     )
 
 

@@ -77,14 +77,8 @@ _TINY = 1e-12
 
 @kernel
 def evaluate(
-    stage: int,
-    rays: np.ndarray,
-    free: np.ndarray,
-    terms: Terms,
-    parameters: np.ndarray,
-    rotation: np.ndarray,
-    met: np.ndarray,
-    sums: np.ndarray,
+    stage: int, rays: np.ndarray, free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray,
+    met: np.ndarray, sums: np.ndarray,
 ) -> float:
     """Cost at a body; fills ``sums`` (14, 14), lower triangle: J^T J in rows 0 to 12, J^T r in row 13.
 
@@ -211,14 +205,8 @@ def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: 
 
 @kernel
 def _free_rows(
-    filled: int,
-    terms: Terms,
-    parameters: np.ndarray,
-    rotation: np.ndarray,
-    lanes: np.ndarray,
-    missed: np.ndarray,
-    block: np.ndarray,
-    sums: np.ndarray,
+    filled: int, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, lanes: np.ndarray, missed: np.ndarray,
+    block: np.ndarray, sums: np.ndarray,
 ) -> float:
     """Cost of the residuals of free rays that cross the bounding box; adds them to the normal equations."""
     lowest(filled, 1.0, LOWEST_TOLERANCE, parameters, lanes, missed)

@@ -104,14 +104,9 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
         off = float(np.median(distance) / body.size.min())
         reason = f"no superquadric found: half of the points lie more than {off:.0%} of its smallest half size off"
     return Fit(
-        superquadric=body,
-        residual=residual,
-        status=Status.FAILED if reason else Status.CONVERGED,
-        message=reason or "converged",
-        noise=residual,
-        inlier_share=float(np.mean(distance <= INLIER * residual)),
-        iterations=state.iterations,
-        milliseconds=(time.perf_counter() - began) * 1e3,
+        superquadric=body, residual=residual, status=Status.FAILED if reason else Status.CONVERGED,
+        message=reason or "converged", noise=residual, inlier_share=float(np.mean(distance <= INLIER * residual)),
+        iterations=state.iterations, milliseconds=(time.perf_counter() - began) * 1e3,
     )
 
 

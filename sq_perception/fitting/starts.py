@@ -173,10 +173,7 @@ def _moments(pairs: np.ndarray, centre: np.ndarray, shortest: float) -> np.ndarr
 
 @kernel
 def _opposite_pairs(
-    depth: np.ndarray,
-    inside: np.ndarray,
-    lens: Lens,
-    stride: int,
+    depth: np.ndarray, inside: np.ndarray, lens: Lens, stride: int,
 ) -> tuple[float, float, np.ndarray]:
     """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points.
 

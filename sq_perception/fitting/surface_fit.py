@@ -72,10 +72,7 @@ standard deviations, with this weight 3 %."""
 
 
 def fit(
-    depth: np.ndarray,
-    mask: np.ndarray,
-    camera: Camera,
-    *,
+    depth: np.ndarray, mask: np.ndarray, camera: Camera, *,
     start: Superquadric | Literal["auto"] | Sequence[Superquadric] | Callable[[], Superquadric] = "auto",
     options: FitOptions | None = None,
 ) -> Fit:

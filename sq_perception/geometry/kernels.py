@@ -279,16 +279,7 @@ def support_derivatives(
 
 @inline_kernel
 def support_at(
-    s: float,
-    nx: float,
-    ny: float,
-    nz: float,
-    a1: float,
-    a2: float,
-    a3: float,
-    e1: float,
-    e2: float,
-    k1: float,
+    s: float, nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float,
     k2: float,
 ) -> Support:
     """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; without a taper any will do."""

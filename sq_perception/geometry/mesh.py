@@ -63,8 +63,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
     if resolution < 8 or resolution % 8:
         raise ValueError(f"resolution: expected a positive multiple of 8, got {resolution}")
     eta, omega = np.meshgrid(
-        np.linspace(-np.pi / 2, np.pi / 2, resolution + 1),
-        np.linspace(-np.pi, np.pi, resolution, endpoint=False),
+        np.linspace(-np.pi / 2, np.pi / 2, resolution + 1), np.linspace(-np.pi, np.pi, resolution, endpoint=False),
         indexing="ij",
     )
     unit = Superquadric.at_origin(np.ones(3), body.shape)
@@ -113,13 +112,8 @@ def outline(body: Superquadric, resolution: int = MARKER_RESOLUTION) -> np.ndarr
 
 
 def export(
-    bodies: Superquadric | Sequence[Superquadric],
-    path: str | Path,
-    *,
-    resolution: int = 64,
-    colours: np.ndarray | None = None,
-    names: Sequence[str] | None = None,
-    optical: bool = True,
+    bodies: Superquadric | Sequence[Superquadric], path: str | Path, *, resolution: int = 64,
+    colours: np.ndarray | None = None, names: Sequence[str] | None = None, optical: bool = True,
 ) -> Path:
     """Write bodies as a coloured scene.
 

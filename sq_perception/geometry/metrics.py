@@ -79,14 +79,8 @@ def _column(body: np.ndarray, m: np.ndarray, x: float, y: float, z0: float, step
 
 @parallel_kernel
 def _iou_batch(
-    a: np.ndarray,
-    a_matrix: np.ndarray,
-    b: np.ndarray,
-    b_matrix: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    resolution: int,
-    out: np.ndarray,
+    a: np.ndarray, a_matrix: np.ndarray, b: np.ndarray, b_matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray,
+    resolution: int, out: np.ndarray,
 ) -> None:
     for k in numba.prange(a.shape[0]):
         step = (upper[k] - lower[k]) / (resolution - 1)

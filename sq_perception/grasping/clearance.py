@@ -84,12 +84,7 @@ def gaps_to_bodies(
 
 @kernel
 def _gap(
-    box: np.ndarray,
-    centre: np.ndarray,
-    axes: np.ndarray,
-    reach: np.ndarray,
-    body: np.ndarray,
-    enough: float,
+    box: np.ndarray, centre: np.ndarray, axes: np.ndarray, reach: np.ndarray, body: np.ndarray, enough: float,
     way: np.ndarray,
 ) -> float:
     """Return the gap of a box to a body, in the box's frame, along ``way`` (3,).

@@ -142,31 +142,16 @@ class Gripper:
 
 
 PANDA = Gripper(
-    name="panda",
-    opening=0.080,
-    finger_width=0.0175,
-    finger_thickness=0.0152,
-    tip=0.0095,
-    palm=0.0374,
-    hand=(0.063, 0.204, 0.066),
-    force=70.0,
-    link="panda_hand",
-    link_from_tcp=((0.0, 0.0, 0.1034), (0.0, 0.0, 0.0, 1.0)),
+    name="panda", opening=0.080, finger_width=0.0175, finger_thickness=0.0152, tip=0.0095, palm=0.0374,
+    hand=(0.063, 0.204, 0.066), force=70.0, link="panda_hand", link_from_tcp=((0.0, 0.0, 0.1034), (0.0, 0.0, 0.0, 1.0)),
     joints=("panda_finger_joint1", "panda_finger_joint2"),
 )
 """Franka Hand.  Opening 80 mm, 70 N without end: its data sheet.  Boxes of pads and hand, TCP, joints:
 franka_description."""
 
 ROBOTIQ_2F_85 = Gripper(
-    name="robotiq_2f_85",
-    opening=0.085,
-    finger_width=0.022,
-    finger_thickness=0.014,
-    tip=0.019,
-    palm=0.0335,
-    hand=(0.075, 0.165, 0.108),
-    force=100.0,
-    link="robotiq_85_base_link",
+    name="robotiq_2f_85", opening=0.085, finger_width=0.022, finger_thickness=0.014, tip=0.019, palm=0.0335,
+    hand=(0.075, 0.165, 0.108), force=100.0, link="robotiq_85_base_link",
     link_from_tcp=((0.0, 0.0, 0.1415), _QUARTER_TURN),
 )
 """Robotiq 2F-85.  Stroke 85 mm, 20 to 235 N: its manual.  The rest follows from the joints in ROS-Industrial's model of
@@ -175,15 +160,8 @@ it moves by -11 and +3 mm when the gripper opens and closes; the hand reaches 10
 when they are wide open.  The thickness of a finger, to half a centimetre, is that of its end."""
 
 ROBOTIQ_2F_140 = Gripper(
-    name="robotiq_2f_140",
-    opening=0.140,
-    finger_width=0.027,
-    finger_thickness=0.018,
-    tip=0.0325,
-    palm=0.0535,
-    hand=(0.075, 0.210, 0.141),
-    force=100.0,
-    link="robotiq_140_base_link",
+    name="robotiq_2f_140", opening=0.140, finger_width=0.027, finger_thickness=0.018, tip=0.0325, palm=0.0535,
+    hand=(0.075, 0.210, 0.141), force=100.0, link="robotiq_140_base_link",
     link_from_tcp=((0.0, 0.0, 0.1945), (0.0, 0.0, 0.0, 1.0)),
 )
 """Robotiq 2F-140.  Stroke 140 mm, 10 to 125 N: its manual; the rest as for the 2F-85: pads of 27 x 65 mm; the TCP moves

@@ -101,13 +101,8 @@ def grasps_of(objects: Sequence[FittedObject], gripper: Gripper, around: Surroun
 
 
 def grasps(
-    bodies: Superquadric,
-    gripper: Gripper,
-    covariance: np.ndarray | None = None,
-    around: Surroundings | None = None,
-    friction: float = FRICTION,
-    placement: float = PLACEMENT,
-    things: np.ndarray | None = None,
+    bodies: Superquadric, gripper: Gripper, covariance: np.ndarray | None = None, around: Surroundings | None = None,
+    friction: float = FRICTION, placement: float = PLACEMENT, things: np.ndarray | None = None,
 ) -> GraspPlan:
     """Plan grasps of some things, with the reason for those that have none.
 
@@ -204,12 +199,7 @@ def warm_up() -> None:
 
 
 def _trials(
-    bodies: KnownBodies,
-    loads: np.ndarray,
-    found: Closings,
-    gripper: Gripper,
-    around: Surroundings,
-    friction: float,
+    bodies: KnownBodies, loads: np.ndarray, found: Closings, gripper: Gripper, around: Surroundings, friction: float,
     placement: float,
 ) -> Trials:
     """Return every closing from every side, at every depth and slide, with the margins of the body alone."""
@@ -258,12 +248,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
 
 
 def _among_others(
-    bodies: KnownBodies,
-    whole: np.ndarray,
-    trials: Trials,
-    gripper: Gripper,
-    around: Surroundings,
-    placement: float,
+    bodies: KnownBodies, whole: np.ndarray, trials: Trials, gripper: Gripper, around: Surroundings, placement: float,
 ) -> Trials:
     """Return the best trials with the margins of the surroundings."""
     if not len(trials.owner):
@@ -301,11 +286,6 @@ def _as_grasps(trials: Trials) -> Iterator[Grasp]:
     scores, weakest = np.exp(total), trials.weakest
     for k in order:
         yield Grasp(
-            int(trials.owner[k]),
-            trials.frames[k, :, 3],
-            turns[k],
-            float(trials.opening[k]),
-            float(trials.width[k]),
-            float(scores[k]),
-            MARGINS[weakest[k]],
+            int(trials.owner[k]), trials.frames[k, :, 3], turns[k], float(trials.opening[k]), float(trials.width[k]),
+            float(scores[k]), MARGINS[weakest[k]],
         )

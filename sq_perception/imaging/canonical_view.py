@@ -118,14 +118,8 @@ class CanonicalView:
 
 
 def from_mask(
-    depth: np.ndarray,
-    mask: np.ndarray,
-    camera: Camera,
-    pixels: int = 64,
-    *,
-    find_hidden: bool = False,
-    plane: np.ndarray | None = None,
-    missing_is_hidden: bool = False,
+    depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int = 64, *, find_hidden: bool = False,
+    plane: np.ndarray | None = None, missing_is_hidden: bool = False,
 ) -> CanonicalView:
     """The canonical view of the object under a mask.
 
@@ -287,14 +281,8 @@ def _rotate(
 
 @kernel
 def _nearer(
-    depth: np.ndarray,
-    mask: np.ndarray,
-    filled: np.ndarray,
-    lost: np.ndarray,
-    lens: Lens,
-    matrix: np.ndarray,
-    plane: np.ndarray,
-    tolerance: float,
+    depth: np.ndarray, mask: np.ndarray, filled: np.ndarray, lost: np.ndarray, lens: Lens, matrix: np.ndarray,
+    plane: np.ndarray, tolerance: float,
 ) -> np.ndarray:
     """How much nearer than the object, metres, the reading at each pixel (height, width) beside it is.
 
@@ -318,16 +306,8 @@ def _nearer(
 
 @kernel
 def _resample(
-    image: np.ndarray,
-    filled: np.ndarray,
-    nearer: np.ndarray,
-    whole: tuple[int, int, int, int],
-    lens: Lens,
-    matrix: np.ndarray,
-    anchor: np.ndarray,
-    extent: float,
-    z_guess: float,
-    pixels: int,
+    image: np.ndarray, filled: np.ndarray, nearer: np.ndarray, whole: tuple[int, int, int, int], lens: Lens,
+    matrix: np.ndarray, anchor: np.ndarray, extent: float, z_guess: float, pixels: int,
 ) -> tuple[np.ndarray, np.ndarray]:
     """``image`` and ``beside`` (pixels, pixels) of a view, each from the nearest pixel of a crop (height, width).
 

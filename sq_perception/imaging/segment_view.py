@@ -75,11 +75,7 @@ class SegmentView:
 
 
 def from_segment(
-    depth: np.ndarray,
-    labels: np.ndarray,
-    label: int,
-    window: tuple[slice, slice],
-    camera: Camera,
+    depth: np.ndarray, labels: np.ndarray, label: int, window: tuple[slice, slice], camera: Camera,
     plane: np.ndarray | None,
 ) -> SegmentView:
     """The view of a segment with at least one reading.
@@ -150,16 +146,8 @@ def _compact(at: np.ndarray, count: int, row: float, column: float) -> np.ndarra
 
 @kernel
 def _show(
-    image: np.ndarray,
-    depth: np.ndarray,
-    labels: np.ndarray,
-    label: int,
-    rows: np.ndarray,
-    columns: np.ndarray,
-    pinhole: tuple[float, float, float, float],
-    plane: np.ndarray,
-    middle: float,
-    scale: float,
+    image: np.ndarray, depth: np.ndarray, labels: np.ndarray, label: int, rows: np.ndarray, columns: np.ndarray,
+    pinhole: tuple[float, float, float, float], plane: np.ndarray, middle: float, scale: float,
 ) -> None:
     """Write what the cells of an empty view show.
 

@@ -73,9 +73,7 @@ def resolve(model: Path | str | None = None) -> Path:
 
 
 def save(
-    path: Path | str,
-    model: Regressor | ThingNetwork | MaskNetwork,
-    notes: dict[str, Any] | None = None,
+    path: Path | str, model: Regressor | ThingNetwork | MaskNetwork, notes: dict[str, Any] | None = None,
     dtype: type[np.floating[Any]] = np.float16,
 ) -> None:
     """Write a network and ``notes`` (JSON values) to ``path``; replaced at once, never half written."""

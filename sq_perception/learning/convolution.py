@@ -266,13 +266,7 @@ def _write_tiles(x: np.ndarray, side: int, size: int, tiles: np.ndarray) -> None
 
 @kernel
 def _write_pixels(
-    tiles: np.ndarray,
-    size: int,
-    bias: np.ndarray,
-    skip: np.ndarray,
-    is_added: bool,
-    margin: int,
-    side: int,
+    tiles: np.ndarray, size: int, bias: np.ndarray, skip: np.ndarray, is_added: bool, margin: int, side: int,
     out: np.ndarray,
 ) -> None:
     """max(0, A^T m A + bias + skip) of every tile into framed images."""

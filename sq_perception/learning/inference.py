@@ -119,9 +119,7 @@ class ThingPredictor:
         of_straight, of_turned = np.split(covariance, 2)
         back = mirrored(0)
         return HullPredictions(
-            bodies[: len(views)],
-            (straight + turned[:, back]) / 2,
-            (of_straight + of_turned[:, back][:, :, back]) / 2,
+            bodies[: len(views)], (straight + turned[:, back]) / 2, (of_straight + of_turned[:, back][:, :, back]) / 2,
             self.config.freedom,
         )
 
@@ -236,8 +234,6 @@ def mean_body(answers: Superquadric) -> Superquadric:
     weights = ((np.abs(cosine) > farthest) / (np.abs(cosine) > farthest).sum(axis=0))[..., None]
     turn = (weights * np.sign(cosine)[..., None] * near.rotation).sum(axis=0)
     return Superquadric(
-        np.exp((weights * np.log(near.size)).sum(axis=0)),
-        (weights * near.shape).sum(axis=0),
-        (weights * near.translation).sum(axis=0),
-        turn / np.linalg.norm(turn, axis=1, keepdims=True),
+        np.exp((weights * np.log(near.size)).sum(axis=0)), (weights * near.shape).sum(axis=0),
+        (weights * near.translation).sum(axis=0), turn / np.linalg.norm(turn, axis=1, keepdims=True),
     )

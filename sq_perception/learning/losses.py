@@ -187,11 +187,7 @@ class Objective:
         return start * (end / start) ** progress
 
     def loss(
-        self,
-        prediction: Superquadric,
-        views: torch.Tensor,
-        truth: Superquadric | None,
-        progress: float,
+        self, prediction: Superquadric, views: torch.Tensor, truth: Superquadric | None, progress: float,
         generator: torch.Generator,
     ) -> torch.Tensor:
         """The loss of each body (n,); views (n, 1, p, p), and the labels only where :attr:`needs_labels` is true."""

@@ -71,10 +71,8 @@ class RegressorConfig:
         unit = 1 / (1 + xp.exp(-raw[..., :8]))
         low, high = self.size_range
         return Superquadric(
-            low * (high / low) ** unit[..., 0:3],
-            _between(self.shape_range, unit[..., 3:5]),
-            _between(self.translation_range, unit[..., 5:8]),
-            quaternions.from_six(raw[..., 8:]),
+            low * (high / low) ** unit[..., 0:3], _between(self.shape_range, unit[..., 3:5]),
+            _between(self.translation_range, unit[..., 5:8]), quaternions.from_six(raw[..., 8:]),
         )
 
     def view_of(

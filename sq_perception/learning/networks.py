@@ -183,10 +183,7 @@ class Regressor(nn.Module):
             self.features = compact_backbone(config.widths, config.blocks)
             inputs = config.widths[-1] * (config.pixels // config.stride) ** 2
         self.mixer = nn.Sequential(
-            nn.Flatten(),
-            nn.Linear(inputs, config.hidden),
-            nn.ReLU(),
-            nn.Linear(config.hidden, config.hidden),
+            nn.Flatten(), nn.Linear(inputs, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden),
             nn.ReLU(),
         )
         self.size_head = nn.Linear(config.hidden, 3)
@@ -277,9 +274,7 @@ class ThingNetwork(nn.Module):
         self.features = compact_backbone(config.widths, config.blocks, channels_in=2)
         inputs = config.widths[-1] * (config.pixels // self._encoding.stride) ** 2
         self.mixer = nn.Sequential(
-            nn.Linear(inputs + PLANE + EXTENT, config.hidden),
-            nn.ReLU(),
-            nn.Linear(config.hidden, config.hidden),
+            nn.Linear(inputs + PLANE + EXTENT, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden),
             nn.ReLU(),
         )
         self.body_head = nn.Linear(config.hidden, BODY_OUTPUTS)

@@ -158,11 +158,8 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
             return subject.validate(network, held)
 
         course = Course(
-            f"train-{subject.name}",
-            subject.name,
-            batch,
-            lambda predicted, shown, truth, progress: subject.loss(predicted, *shown, truth),
-            validate,
+            f"train-{subject.name}", subject.name, batch,
+            lambda predicted, shown, truth, progress: subject.loss(predicted, *shown, truth), validate,
             lambda network: subject.finish(network, held),
         )
         return run(state, config, course)
@@ -296,19 +293,10 @@ def _mask_batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generato
 
 
 THINGS = Subject(
-    "things",
-    draw_thing_views(0, np.random.default_rng(0)),
-    _begin_things,
-    _thing_batch,
-    hull_loss,
-    validate_things,
+    "things", draw_thing_views(0, np.random.default_rng(0)), _begin_things, _thing_batch, hull_loss, validate_things,
     calibrate_spread,
 )
 MASKS = Subject(
-    "masks",
-    draw_segment_views(0, np.random.default_rng(0)),
-    lambda start: checkpoint.load_masks(start) if start else MaskNetwork(),
-    _mask_batch,
-    mask_loss,
-    validate_masks,
+    "masks", draw_segment_views(0, np.random.default_rng(0)),
+    lambda start: checkpoint.load_masks(start) if start else MaskNetwork(), _mask_batch, mask_loss, validate_masks,
 )

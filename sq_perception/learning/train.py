@@ -37,9 +37,7 @@ _FORM = ("backbone", "framing", "pixels")
 
 
 def train(
-    config: TrainingConfig,
-    output: Path,
-    network: RegressorConfig | None = None,
+    config: TrainingConfig, output: Path, network: RegressorConfig | None = None,
     advance: Callable[[int, float], None] = lambda step, loss: None,
 ) -> Regressor:
     """Run, or continue, a training; returns the averaged network, also saved in ``output``.

@@ -132,9 +132,6 @@ def _at_end(
         return None
     deepest = below >= np.quantile(below, 1 - _DEEPEST)
     return Cavity(
-        rim=centre + level * turn[:, 2],
-        axis=turn[:, 2].copy(),
-        half_widths=np.sort(size[:2]),
-        depth=float(np.median(below[deepest])),
-        sees_floor=bool(np.median(rho[passes][deepest]) < _FLOOR),
+        rim=centre + level * turn[:, 2], axis=turn[:, 2].copy(), half_widths=np.sort(size[:2]),
+        depth=float(np.median(below[deepest])), sees_floor=bool(np.median(rho[passes][deepest]) < _FLOOR),
     )

@@ -138,11 +138,7 @@ class Recoverer:
     """
 
     def __init__(
-        self,
-        model: Path | str | None = None,
-        device: str = "cpu",
-        method: Method = "auto",
-        threads: int | None = None,
+        self, model: Path | str | None = None, device: str = "cpu", method: Method = "auto", threads: int | None = None,
     ) -> None:
         if not isinstance(model, str | Path | None):
             given = type(model).__name__
@@ -186,10 +182,7 @@ class Recoverer:
         hole_filling.fill(image)
 
     def recover(
-        self,
-        depth: np.ndarray,
-        camera: Camera,
-        labels: np.ndarray | None = None,
+        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None = None,
         options: RecoveryOptions | None = None,
     ) -> FrameRecovery:
         """Recover every object of a depth image.
@@ -215,10 +208,7 @@ class Recoverer:
         return self.recover_objects(readings, self.find_objects(readings))
 
     def read(
-        self,
-        depth: np.ndarray,
-        camera: Camera,
-        labels: np.ndarray | None = None,
+        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None = None,
         options: RecoveryOptions | None = None,
     ) -> Readings:
         """Check an image, parameters as in :meth:`recover`, and fill its small holes."""
@@ -353,13 +343,8 @@ class Recoverer:
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _find_parts(
-        self,
-        objects: Sequence[SeenObject],
-        fits: Sequence[Fit],
-        depth: np.ndarray,
-        readings: Readings,
-        network: Network | None,
-        deadline: float,
+        self, objects: Sequence[SeenObject], fits: Sequence[Fit], depth: np.ndarray, readings: Readings,
+        network: Network | None, deadline: float,
     ) -> list[Parts | None]:
         """Find the parts of each object; None where one body explains it, or parts are not asked for."""
         camera, options = readings.camera, readings.options

@@ -148,10 +148,7 @@ class StillScene:
         self.last = last
 
     def recover(
-        self,
-        depth: np.ndarray,
-        camera: Camera,
-        labels: np.ndarray | None = None,
+        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None = None,
         options: RecoveryOptions | None = None,
     ) -> FrameRecovery:
         """Recover every object of the next frame; parameters and errors as those of :meth:`Recoverer.recover`."""

@@ -109,11 +109,8 @@ def recover_all(
 
 
 def recover_crops(
-    depths: Sequence[np.ndarray],
-    cameras: Camera | Sequence[Camera],
-    masks: Sequence[np.ndarray] | None = None,
-    options: RecoveryOptions | None = None,
-    jobs: int = 1,
+    depths: Sequence[np.ndarray], cameras: Camera | Sequence[Camera], masks: Sequence[np.ndarray] | None = None,
+    options: RecoveryOptions | None = None, jobs: int = 1,
 ) -> list[Recovery | None]:
     """Recover the one object of each of n images.
 

@@ -102,9 +102,7 @@ class FrameEvidence:
         number[order] = np.arange(len(order)) + 1
         place = [self.ids.index(label) for label in order] if self.same is not None else []
         return replace(
-            self,
-            labels=regions.renumber(self.labels, number),
-            ids=tuple(range(1, len(order) + 1)),
+            self, labels=regions.renumber(self.labels, number), ids=tuple(range(1, len(order) + 1)),
             objectness=tuple(likely[label] for label in order),
             same=None if self.same is None else self.same[np.ix_(place, place)],
         )

@@ -102,10 +102,7 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
 
 
 def support(
-    candidates: list[Plane],
-    depth: np.ndarray,
-    valid: np.ndarray,
-    camera: Camera,
+    candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camera: Camera,
 ) -> Plane | None:
     """The plane that things stand on, of some planes of an image; None if there are none.
 
@@ -129,11 +126,7 @@ def support(
 
 
 def around(
-    labels: np.ndarray,
-    ids: tuple[int, ...],
-    depth: np.ndarray,
-    valid: np.ndarray,
-    camera: Camera,
+    labels: np.ndarray, ids: tuple[int, ...], depth: np.ndarray, valid: np.ndarray, camera: Camera,
     known: np.ndarray | None = None,
 ) -> Plane | None:
     """The support plane from the unlabelled pixels near the bodies: below all of them, and touched.

@@ -254,18 +254,14 @@ def draw_stages(rng: np.random.Generator, ranges: StageRanges = RANGES) -> Stage
     has_ring, is_bent = whether(ranges.ring), whether(ranges.bend)
     return Stages(
         frames=int(rng.integers(*ranges.frames, endpoint=True)) if whether(ranges.temporal) else 1,
-        decimation=2 if whether(ranges.decimation) else 1,
-        factor=rng.uniform(*ranges.factor),
-        threshold=steps,
+        decimation=2 if whether(ranges.decimation) else 1, factor=rng.uniform(*ranges.factor), threshold=steps,
         rounds=int(rng.integers(*ranges.rounds, endpoint=True)) if whether(ranges.spatial) else 0,
         outer=int(rng.integers(*ranges.outer, endpoint=True)) if has_ring else 0,
         inner=int(rng.integers(*ranges.inner, endpoint=True)) if has_ring and whether(ranges.both_sides) else 0,
-        edge=rng.uniform(*ranges.edge),
-        foot=whether(ranges.foot),
+        edge=rng.uniform(*ranges.edge), foot=whether(ranges.foot),
         filling=get_args(Filling)[rng.integers(3)] if whether(ranges.filling) else None,
         beside=rng.choice((-1, 1)) * rng.uniform(*ranges.baseline) if whether(ranges.alignment) else 0.0,
-        focal=rng.uniform(*ranges.focal),
-        whole=whether(0.5),
+        focal=rng.uniform(*ranges.focal), whole=whether(0.5),
         slope=(rng.uniform(-1, 1) * ranges.slope, rng.uniform(-1, 1) * ranges.slope) if is_bent else (0.0, 0.0),
         bow=rng.uniform(-1, 1) * ranges.slope if is_bent else 0.0,
         median=(3, 5)[rng.integers(2)] if whether(ranges.median) else 0,
@@ -321,12 +317,8 @@ def _fill(depth: np.ndarray, rule: int) -> None:
 
 @kernel
 def _draw(
-    depth: np.ndarray,
-    lens: tuple[float, float, float, float, bool],
-    beside: np.ndarray,
-    out: np.ndarray,
-    onto: tuple[float, float, float, float, bool],
-    half: float,
+    depth: np.ndarray, lens: tuple[float, float, float, float, bool], beside: np.ndarray, out: np.ndarray,
+    onto: tuple[float, float, float, float, bool], half: float,
 ) -> None:
     """Draw readings into another camera's image of +inf, each as wide as twice ``half`` pixels; see :func:`align`."""
     fx, fy, cx, cy, _ = lens

@@ -30,13 +30,8 @@ from sq_perception.imaging.raycast import render, windows
 
 
 def render_things(
-    parts: Superquadric,
-    owner: np.ndarray,
-    cavities: Superquadric,
-    cavity_owner: np.ndarray,
-    camera: Camera,
-    table: np.ndarray | None = None,
-    behind: float = np.inf,
+    parts: Superquadric, owner: np.ndarray, cavities: Superquadric, cavity_owner: np.ndarray, camera: Camera,
+    table: np.ndarray | None = None, behind: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Render depth and the index of the visible object of every pixel.
 

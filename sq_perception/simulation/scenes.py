@@ -58,10 +58,8 @@ class Scene:
 def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
     """Draw a batch (count,) of bodies of the thesis' protocol, in the cube frame."""
     return Superquadric(
-        rng.uniform(*THESIS_SIZE, (count, 3)),
-        rng.uniform(0.1, 1.0, (count, 2)),
-        rng.uniform(88 / 255, 168 / 255, (count, 3)),
-        quaternions.random(count, rng),
+        rng.uniform(*THESIS_SIZE, (count, 3)), rng.uniform(0.1, 1.0, (count, 2)),
+        rng.uniform(88 / 255, 168 / 255, (count, 3)), quaternions.random(count, rng),
     )
 
 

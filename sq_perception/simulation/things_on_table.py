@@ -111,11 +111,8 @@ class _Resting:
 
 
 def things_on_table(
-    rng: np.random.Generator,
-    count: int | None = None,
-    camera: Camera = TABLE_CAMERA,
-    elevation: tuple[float, float] = ELEVATION,
-    kinds: Sequence[str] | None = None,
+    rng: np.random.Generator, count: int | None = None, camera: Camera = TABLE_CAMERA,
+    elevation: tuple[float, float] = ELEVATION, kinds: Sequence[str] | None = None,
 ) -> ThingsOnTable:
     """Place ``count`` objects, or 1 to 8, of some kinds or of any, on a table, all wholly inside the image.
 

@@ -48,12 +48,8 @@ class Occluder(NamedTuple):
 
 
 def render_views(
-    bodies: Superquadric,
-    pixels: int = 64,
-    levels: np.ndarray | None = None,
-    distance: np.ndarray | None = None,
-    occluder: Occluder | None = None,
-    miss: np.ndarray | None = None,
+    bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None, distance: np.ndarray | None = None,
+    occluder: Occluder | None = None, miss: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Superquadric]:
     """Render the canonical view of each body alone, fitted to its visible part as :func:`canonical_view.from_mask`.
 
@@ -94,16 +90,8 @@ def render_views(
 
 @parallel_kernel
 def _render_views(
-    flat: np.ndarray,
-    matrices: np.ndarray,
-    anchor: np.ndarray,
-    side: np.ndarray,
-    quantum: np.ndarray,
-    pinhole: np.ndarray,
-    eye: np.ndarray,
-    fronts: np.ndarray,
-    misses: np.ndarray,
-    images: np.ndarray,
+    flat: np.ndarray, matrices: np.ndarray, anchor: np.ndarray, side: np.ndarray, quantum: np.ndarray,
+    pinhole: np.ndarray, eye: np.ndarray, fronts: np.ndarray, misses: np.ndarray, images: np.ndarray,
 ) -> None:
     """Render all images; ``anchor`` and ``side`` become those of the views."""
     for k in numba.prange(flat.shape[0]):
@@ -113,14 +101,8 @@ def _render_views(
 
 @kernel
 def _render_view(
-    body: np.ndarray,
-    turn: np.ndarray,
-    anchor: np.ndarray,
-    side: float,
-    sensed: _Sensed,
-    front: np.ndarray,
-    miss: np.ndarray,
-    image: np.ndarray,
+    body: np.ndarray, turn: np.ndarray, anchor: np.ndarray, side: float, sensed: _Sensed, front: np.ndarray,
+    miss: np.ndarray, image: np.ndarray,
 ) -> float:
     """Render, find the visible extent, and render again until the extent is the view's side."""
     pixels = image.shape[0]
@@ -166,15 +148,8 @@ def _render_view(
 
 @kernel
 def _cast(
-    body: np.ndarray,
-    turn: np.ndarray,
-    anchor: np.ndarray,
-    side: float,
-    sensed: _Sensed,
-    front: np.ndarray,
-    curtain: _Curtain,
-    surface: np.ndarray,
-    reach: np.ndarray,
+    body: np.ndarray, turn: np.ndarray, anchor: np.ndarray, side: float, sensed: _Sensed, front: np.ndarray,
+    curtain: _Curtain, surface: np.ndarray, reach: np.ndarray,
 ) -> None:
     """Return what the rays of a view meet: z of the body, :data:`_NOTHING`, or :data:`_BEHIND` an occluder.
 

@@ -138,13 +138,8 @@ def update(track: Estimate, seen: Observation, turning: np.ndarray) -> Estimate:
     step = np.einsum("nij,nj->ni", gain, error)
     back = quaternions.to_matrix(quaternions.from_rotation_vector(np.where(has_turned, 0.0, step[:, TURN])))
     return Estimate(
-        states.add(track.state, step),
-        0.5 * (covariance + covariance.swapaxes(1, 2)),
-        kept @ track.lasting + gain @ root(seen.shared),
-        directions @ back,
-        biases,
-        correlations,
-        used,
+        states.add(track.state, step), 0.5 * (covariance + covariance.swapaxes(1, 2)),
+        kept @ track.lasting + gain @ root(seen.shared), directions @ back, biases, correlations, used,
     )
 
 

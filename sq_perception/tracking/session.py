@@ -98,14 +98,8 @@ class TrackingSession:
         self.tracks = ()
 
     def follow(
-        self,
-        observed: Sequence[Observed],
-        stamp: float,
-        camera_pose: object = None,
-        *,
-        is_pose_known: bool = True,
-        camera: Camera | None = None,
-        depth: np.ndarray | None = None,
+        self, observed: Sequence[Observed], stamp: float, camera_pose: object = None, *, is_pose_known: bool = True,
+        camera: Camera | None = None, depth: np.ndarray | None = None,
     ) -> tuple[Followed, ...]:
         """The bodies of another frame, in the order of ``observed``.
 

@@ -116,11 +116,8 @@ class Body:
             # Once: however many frames pass meanwhile, it cannot be forgotten more.
             variance[POSE] += np.maximum(HAND**2 - np.diag(estimate.covariance)[POSE], 0.0)
         return replace(
-            self,
-            estimate=estimate._replace(state=state, covariance=estimate.covariance + np.diag(variance)),
-            velocity=velocity,
-            observation=None,
-            answer=self.answer if self.observation is not None else None,
+            self, estimate=estimate._replace(state=state, covariance=estimate.covariance + np.diag(variance)),
+            velocity=velocity, observation=None, answer=self.answer if self.observation is not None else None,
             at_rest=at_rest,
         )
 
@@ -138,15 +135,10 @@ class Body:
         covariance = self.estimate.total
         known = TrackState.CONFIRMED if self.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
         return Track(
-            id=self.id,
-            superquadric=Superquadric.from_flat(self.estimate.state.copy()),
-            sigma_size=np.sqrt(np.diag(covariance)[0:3]),
-            covariance=covariance,
-            velocity=self.velocity.copy(),
-            seen=self.seen,
-            state=known if self.observation is not None else TrackState.LOST,
-            observation=self.observation,
-            follows=self.follows and self.observation is not None,
+            id=self.id, superquadric=Superquadric.from_flat(self.estimate.state.copy()),
+            sigma_size=np.sqrt(np.diag(covariance)[0:3]), covariance=covariance, velocity=self.velocity.copy(),
+            seen=self.seen, state=known if self.observation is not None else TrackState.LOST,
+            observation=self.observation, follows=self.follows and self.observation is not None,
         )
 
 

@@ -72,10 +72,8 @@ class _Frame(NamedTuple):
         least_white = 1e-6
         gamma, least = self.gamma[pairs.observed, None, None], _least(pairs.state)
         return Observation(
-            pairs.state,
-            (1 - COMMON_SHARE - gamma) * pairs.covariance + least_white * least,
-            COMMON_SHARE * pairs.covariance + (1 - least_white) * least,
-            gamma * pairs.covariance,
+            pairs.state, (1 - COMMON_SHARE - gamma) * pairs.covariance + least_white * least,
+            COMMON_SHARE * pairs.covariance + (1 - least_white) * least, gamma * pairs.covariance,
             self.direction[pairs.observed],
         )
 
@@ -103,12 +101,7 @@ class Tracker:
         self.births = max(self.births, other.births)
 
     def update(
-        self,
-        recoveries: Sequence[Observed],
-        stamp: float,
-        camera_pose: object = None,
-        *,
-        camera: Camera | None = None,
+        self, recoveries: Sequence[Observed], stamp: float, camera_pose: object = None, *, camera: Camera | None = None,
         depth: np.ndarray | None = None,
     ) -> tuple[Track, ...]:
         """The tracks after another frame, oldest first.
@@ -186,9 +179,7 @@ def _in_world(
     flat[:, 5:8] = flat[:, 5:8] @ matrix.T + position
     flat[:, 8:12] = quaternions.multiply(rotation, flat[:, 8:12])
     return _Frame(
-        stamp,
-        flat,
-        state.rotate(covariance, matrix),
+        stamp, flat, state.rotate(covariance, matrix),
         np.array([PREDICTED_SHARE if body.is_predicted else LASTING_SHARE for body in recoveries]),
         visibility.directions(flat[:, 5:8], rotation, position, orthographic),
         np.array([body.repeats > 0 for body in recoveries], dtype=bool),
@@ -279,14 +270,8 @@ def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
     for k, body in enumerate(some):
         insists = body.disagreed >= PATIENCE and not rest.fits[k]
         after[pairs.track[k]] = replace(
-            body,
-            estimate=estimate.at(k),
-            seen=body.seen + 1,
-            missed=0,
-            last=frame.stamp,
-            observation=int(pairs.observed[k]),
-            follows=not (rest.slid[k] or rest.turned[k] or insists),
-            answer=None,
+            body, estimate=estimate.at(k), seen=body.seen + 1, missed=0, last=frame.stamp,
+            observation=int(pairs.observed[k]), follows=not (rest.slid[k] or rest.turned[k] or insists), answer=None,
         )
     return tuple(after)
 
@@ -321,9 +306,7 @@ def _doubt(
             if disagreed >= PATIENCE:
                 covariances[k] *= verdict.excess[k]
         some[k] = replace(
-            body,
-            disagreed=disagreed,
-            last_error=np.zeros(LENGTH) if agrees else error[k],
+            body, disagreed=disagreed, last_error=np.zeros(LENGTH) if agrees else error[k],
             velocity=_velocity(body, error[k, CENTRE], slid and is_out_of_patience, stamp, total[k, CENTRE, CENTRE]),
             agreed=stamp if agrees or is_out_of_patience else body.agreed,
         )
