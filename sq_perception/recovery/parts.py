@@ -64,7 +64,7 @@ _PRICE = 11 / 2 * math.log(_WITNESSES) * 2 / _WITNESSES
 _OPEN = 0.012
 """Free pixels that a body covers, as a share of the object's pixels, from which on it is more than one: a body through
 which nothing was seen leaves no room between parts."""
-_JOINT_SPREAD = 2.0
+_JOINT_SPREAD = 4.0
 """Factor of the covariance of a part: where one ends and the next one begins is not seen."""
 _FINE = 1.3
 """L of good bodies, mostly: where one leaves no more than the price above it, two are not sought, nor handles where
