@@ -195,8 +195,8 @@ def test_commands_draw_on_one_thread_as_a_process_a_core_may(command, monkeypatc
 
 def test_the_shipped_network_finds_outliers_in_scenes_that_it_has_not_seen() -> None:
     """More than half of them, for a fiftieth of the objects' readings."""
-    views = draw_segment_views(12, np.random.default_rng([77, 5]))
+    views = draw_segment_views(20, np.random.default_rng([77, 5]))
     found = shard_training.validate_masks(checkpoint.load_masks(), views)
     assert found["outliers"] > 0.03
-    assert found["left"] < 0.6 * found["outliers"]
+    assert found["left"] < 0.5 * found["outliers"]
     assert found["lost"] < 0.03

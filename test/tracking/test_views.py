@@ -24,7 +24,7 @@ def recoverer():
     return Recoverer()
 
 
-@pytest.mark.parametrize(("seed", "has_masks"), [(4, True), (6, False), (15, False)])
+@pytest.mark.parametrize(("seed", "has_masks"), [(5, True), (6, False), (15, False)])
 def test_axes_keep_their_names_in_a_still_scene(recoverer, seed, has_masks):
     """Round bodies, whose turn no image tells, and boxes and ovals, of which fits take now this axis as z, now that."""
     scene, noise = table_scene(np.random.default_rng(seed), 5), preset("realsense_d435")
