@@ -40,7 +40,7 @@ _UNASKED = 3.4
 LEAST = 0.2
 """What is less likely a thing is left out: a thing that is missed costs as much as four bodies of nothing."""
 _OF_ITS_OWN = (-0.83, 5.0, -3.9)
-"""a', b', c', by 1 512 bodies of 400 scenes of benchmarks/household_things (seeds from 50 000)."""
+"""a', b', c', a regression on bodies of simulated scenes (benchmarks/household_things, seeds from 50 000)."""
 LEAST_OF_ITS_OWN = 0.35
 """What is less likely a thing of its own is left out with its body."""
 _BLOCKS = (4, 32)
