@@ -115,8 +115,8 @@ class SegmentNetwork:
             window = seen[label].window
             _write_membership(membership[window], labels[window] == label, _logits(seen[label]))
         odds = np.maximum(_odds_of_one(labels, seen), -_CLEAREST)
-        same = np.triu(_probability(odds), 1)
-        found = replace(found, labels=labels, ids=tuple(seen), membership=membership, same=same + same.T)
+        affinity = np.triu(_probability(odds), 1)
+        found = replace(found, labels=labels, ids=tuple(seen), membership=membership, affinity=affinity + affinity.T)
         return found.kept(likely)
 
     def _things(

@@ -38,15 +38,16 @@ from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.threads import one_blas_thread, short_turns
-from sq_perception.imaging import depth_units, hole_filling, ranges, raycast
-from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
+from sq_perception.imaging import hole_filling, raycast
+from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import methods, parts, seen_object, supports
 from sq_perception.recovery.cavities import find_cavity
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
-from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.readings import Readings, read
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, render_recovery, timed, what_is_left_out
 from sq_perception.recovery.seen_object import Prediction, SeenObject
 from sq_perception.segmentation import segments
 from sq_perception.segmentation.evidence import FrameEvidence
@@ -66,30 +67,6 @@ _DOUBT = 0.1
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
-
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """One image to recover from.
-
-    Attributes
-    ----------
-    depth : float32 (height, width)
-        Metres, NaN where nothing was measured; small holes of it are filled.
-    closed : bool (height, width) or None
-        The filled pixels: segments and views take them, fits do not.
-    labels : integer (height, width) or None
-        Masks from outside.
-    began
-        When work on it began, by :func:`time.perf_counter`.
-    """
-
-    depth: np.ndarray
-    closed: np.ndarray | None
-    camera: Camera
-    labels: np.ndarray | None
-    options: RecoveryOptions
-    began: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +154,7 @@ class Recoverer:
         image = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
         self.recover(image, camera, (index >= 0).astype(np.int32))
         self.recover(image, camera)
-        _doubt(np.ones_like(image), camera)  # of a wall, which spans enough of the image
+        self.read(np.ones_like(image), camera).doubt()  # of a wall, which spans enough of the image
         image[::2] = np.nan
         hole_filling.fill(image)
 
@@ -211,93 +188,82 @@ class Recoverer:
         self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None = None,
         options: RecoveryOptions | None = None,
     ) -> Readings:
-        """Check an image, parameters as in :meth:`recover`, and fill its small holes."""
-        began = time.perf_counter()
-        measured = _measure(camera.readings(depth), camera)
-        labels = None if labels is None else _masks(labels, measured)
-        measured, labels, closed = hole_filling.fill(measured, labels)
-        return Readings(measured, closed, camera, labels, options or self._options, began)
+        """Check an image and fill its small holes; parameters as in :meth:`recover`."""
+        return read(depth, camera, labels, options or self._options)
 
     def find_objects(self, readings: Readings, segmentation: FrameEvidence | None = None) -> Found:
         """Segment an image; or take the segmentation of one that shows the same objects at the same pixels."""
         with self._at_work():
             found = self._segment(readings) if segmentation is None else segmentation
-            depth = _in_range(readings.depth, found.labels, readings.options.depth_range)
+            depth = readings.within_range(found.labels)
             return Found(found, depth, seen_object.objects(depth, found, readings.camera))
 
     def recover_objects(
         self, readings: Readings, found: Found, known: Mapping[int, Recovery] | None = None
     ) -> FrameRecovery:
         """Recover the objects of an image but those whose bodies are known, by label."""
-        known = known or {}
-        segmented = time.perf_counter()
-        camera, options, depth = readings.camera, readings.options, found.depth
+        bodies = dict(known or {})
+        milliseconds = {"segmentation": 1e3 * (time.perf_counter() - readings.began)}
         with self._at_work():
-            network = self._network_for(readings)
-            config = None if network is None else network.config
-            objects = found.objects
-            if found.segmentation.membership is not None:
-                outliers = found.segmentation.outliers
-                objects = [obj.without(outliers) for obj in objects]
-
-            def prepare(obj: SeenObject) -> SeenObject:
-                plane = supports.support(obj, objects, depth, camera, found.segmentation, options)
-                obj = replace(obj, plane=plane)
-                if readings.labels is not None:
-                    obj = seen_object.completed(obj, depth, camera, found.segmentation.labels)
-                return seen_object.viewed(obj, depth, camera, config)
-
-            fresh = self._mapped(prepare, [obj for obj in objects if obj.label not in known])
-            if network is not None:
-                fresh = self._predict(fresh, network, options)
-            predicted = time.perf_counter()
-
-            if readings.closed is not None:  # what stands in for readings is none to a fit
-                depth = np.where(readings.closed, np.float32(np.nan), depth)
-                fresh = [obj.of_readings(depth, readings.closed, found.segmentation.labels) for obj in fresh]
-            deadline = readings.began + options.time_budget
-            fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), fresh)
-            fits = _doubted(fits, fresh, objects, found.segmentation)
-            made_of = self._find_parts(fresh, fits, depth, readings, network, deadline)
-            fitted = time.perf_counter()
-
-            cavities = [
-                find_cavity(obj, (fit,) if some is None else some.fits) if options.parts else None
-                for obj, fit, some in zip(fresh, fits, made_of, strict=True)
-            ]
-            scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
-        segmentation = found.segmentation
-        likely, same = segmentation.likely(), segmentation.same_as_larger()
-        recovered = dict(known)
-        fragments = []
-        for obj, fit, score, some, cavity in zip(fresh, fits, scores, made_of, cavities, strict=True):
+            with timed(milliseconds, "network"):
+                fresh = self._prepare([obj for obj in found.objects if obj.label not in bodies], readings, found)
+            with timed(milliseconds, "fit"):
+                fresh, fits, made_of = self._fit(fresh, readings, found)
+            with timed(milliseconds, "score"):
+                scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], readings.options), range(len(fresh)))
+        evidence = found.segmentation
+        likely, fragments = evidence.likely(), []
+        same = evidence.same_as_larger()
+        for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True):
             is_judged = obj.label in same and fit.status != Status.FAILED
             own = of_its_own(same[obj.label], score) if is_judged else 1.0
             if own < LEAST_OF_ITS_OWN:
                 fragments.append(obj.label)
-            else:
-                thing = min(own, likely[obj.label])
-                recovered[obj.label] = Recovery(fit, score, obj.label, obj.pixels, thing, parts=some, cavity=cavity)
-        bodies = tuple(recovered[obj.label] for obj in found.objects if obj.label in recovered)
-        labels = segmentation.labels
+                continue
+            thing = min(own, likely[obj.label])
+            cavity = find_cavity(obj, (fit,) if some is None else some.fits) if readings.options.parts else None
+            bodies[obj.label] = Recovery(fit, score, obj.label, obj.pixels, thing, parts=some, cavity=cavity)
+        recovered = tuple(bodies[obj.label] for obj in found.objects if obj.label in bodies)
+        labels = evidence.labels
         if fragments:
             labels = np.where(np.isin(labels, fragments), np.int32(0), labels)
-        scored = time.perf_counter()
-        milliseconds = {
-            "segmentation": 1e3 * (segmented - readings.began),
-            "network": 1e3 * (predicted - segmented),
-            "fit": 1e3 * (fitted - predicted),
-            "score": 1e3 * (scored - fitted),
-            "total": 1e3 * (scored - readings.began),
-        }
-        doubt = _doubt(readings.depth, camera)
-        said = (
-            _without_support(segmentation, readings) if bodies else _why_empty(depth, segmentation, readings.labels),
-            _left_out(segmentation, options),
-            doubt,
-        )
-        message = "; ".join(filter(None, said))
-        return FrameRecovery(bodies, milliseconds, labels, segmentation.plane, message, doubt)
+        doubt = readings.doubt()
+        said = what_is_left_out(readings, evidence, len(recovered), len(fragments))
+        message = "; ".join(filter(None, (*said, doubt)))
+        milliseconds["total"] = 1e3 * (time.perf_counter() - readings.began)
+        return FrameRecovery(recovered, milliseconds, labels, evidence.plane, message, doubt)
+
+    def _prepare(self, objects: Sequence[SeenObject], readings: Readings, found: Found) -> list[SeenObject]:
+        """Find out what some objects stand on, and what the network predicts of them."""
+        depth, camera, evidence = found.depth, readings.camera, found.segmentation
+        network = self._network_for(readings)
+        config = None if network is None else network.config
+
+        def prepare(obj: SeenObject) -> SeenObject:
+            plane = supports.support(obj, found.objects, depth, camera, evidence, readings.options)
+            obj = replace(obj, plane=plane)
+            if readings.labels is not None:
+                obj = seen_object.completed(obj, depth, camera, evidence.labels)
+            return seen_object.viewed(obj, depth, camera, config)
+
+        prepared = self._mapped(prepare, objects)
+        return prepared if network is None else self._predict(prepared, network, readings.options)
+
+    def _fit(
+        self, objects: list[SeenObject], readings: Readings, found: Found
+    ) -> tuple[list[SeenObject], list[Fit], list[Parts | None]]:
+        """Fit the bodies of some objects, and their parts; the objects are returned without filled readings."""
+        depth, camera, options = found.depth, readings.camera, readings.options
+        if readings.filled is not None:  # what stands in for readings is none to a fit
+            depth = np.where(readings.filled, np.float32(np.nan), depth)
+            objects = [obj.of_readings(depth, readings.filled, found.segmentation.labels) for obj in objects]
+        deadline = readings.began + options.time_budget
+        fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), objects)
+        for k, obj in enumerate(objects):
+            same = found.segmentation.affinities(obj.label)
+            others = [(q, other) for other in found.objects if (q := same.get(other.label, 0.0)) > _DOUBT]
+            fits[k] = methods.widened(fits[k], others)
+        return objects, fits, self._find_parts(objects, fits, depth, readings, deadline)
 
     @contextmanager
     def _at_work(self) -> Iterator[None]:
@@ -344,12 +310,13 @@ class Recoverer:
 
     def _find_parts(
         self, objects: Sequence[SeenObject], fits: Sequence[Fit], depth: np.ndarray, readings: Readings,
-        network: Network | None, deadline: float,
+        deadline: float,
     ) -> list[Parts | None]:
         """Find the parts of each object; None where one body explains it, or parts are not asked for."""
         camera, options = readings.camera, readings.options
         if not options.parts or options.method not in ("auto", "symmetry"):
             return [None] * len(objects)
+        network = self._network_for(readings)
         config = None if network is None else network.config
         searches = self._mapped(lambda k: parts.Search(objects[k], fits[k], depth, camera), range(len(objects)))
         divided = self._mapped(parts.Search.next_pieces, searches)
@@ -397,93 +364,3 @@ class Recoverer:
         if (self._path is None and of_things) or checkpoint.predicts_hulls(self._path):
             return inference.load_things(self._path, self._device)
         return inference.load(self._path, self._device)
-
-
-def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What the recovered bodies, or their parts, would look like to the camera.
-
-    Returns
-    -------
-    depth : float64 (height, width)
-        +inf where there is no body.
-    index : int32 (height, width)
-        Position in ``frame.bodies``, -1 where there is none; failed bodies are not drawn.
-    """
-    shown = [(k, solid) for k, body in enumerate(frame.bodies) if body.status != Status.FAILED for solid in body.solids]
-    depth, index = raycast.render(Superquadric.stack([solid for _, solid in shown]), camera)
-    return depth, np.append(np.array([k for k, _ in shown], dtype=np.int32), np.int32(-1))[index]
-
-
-def _measure(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """float32, NaN for all that is no measurement; row by row, as kernels are compiled for arrays of a kind."""
-    farthest = min(GREATEST_DEPTH, float(np.finfo(depth.dtype).max))  # which half precision does not reach
-    within = (depth >= (LEAST_DEPTH if camera.is_pinhole else 0)) & (depth <= farthest)
-    return np.ascontiguousarray(np.where(within, depth, np.nan), dtype=np.float32)
-
-
-def _masks(labels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Given masks, row by row, 0 where they are masked; ValueError if they are not of the shape of the depth."""
-    labels = np.asarray(np.ma.filled(labels, 0), order="C")
-    if labels.shape != depth.shape:
-        raise ValueError(f"labels: expected the shape of the depth, {depth.shape}, got {labels.shape}")
-    return labels
-
-
-def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
-    """The image without an object's own readings out of range: left in, they would pass for free space beside it."""
-    near, far = depth_range
-    if near <= 0 and np.isinf(far):
-        return depth
-    out = (labels > 0) & ((depth < near) | (depth > far))
-    return np.where(out, np.float32(np.nan), depth)
-
-
-def _doubt(depth: np.ndarray, camera: Camera) -> str:
-    """What makes all of an image's bodies doubtful; empty otherwise."""
-    if not camera.is_pinhole:
-        return ""
-    return depth_units.wrong_unit(depth) or (ranges.RANGES if ranges.seem_ranges(depth, camera) else "")
-
-
-def _doubted(
-    fits: Sequence[Fit], fresh: Sequence[SeenObject], objects: Sequence[SeenObject], found: FrameEvidence
-) -> list[Fit]:
-    """The fits of objects, less sure where another object of the frame may be a part of theirs."""
-    if found.same is None:
-        return list(fits)
-    same = dict(zip(found.ids, found.same.tolist(), strict=True))
-    number = {label: k for k, label in enumerate(found.ids)}
-    return [
-        methods.widened(fit, [(q, other) for other in objects if (q := same[obj.label][number[other.label]]) > _DOUBT])
-        for fit, obj in zip(fits, fresh, strict=True)
-    ]
-
-
-def _left_out(found: FrameEvidence, options: RecoveryOptions) -> str:
-    """What was seen and is not among the objects, in words."""
-    said = []
-    if found.larger:
-        objects = "1 object is" if found.larger == 1 else f"{found.larger} objects are"
-        said.append(f"{objects} larger than max_size = {options.max_size:g} m and left out")
-    if found.outside:
-        said.append(f"{found.outside} outside of the workspace left out")
-    if found.is_cut:
-        said.append(f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out")
-    return "; ".join(said)
-
-
-def _why_empty(depth: np.ndarray, found: FrameEvidence, labels: np.ndarray | None) -> str:
-    if not np.isfinite(depth).any():
-        return "the image holds no depth"
-    if labels is not None and labels.max() <= 0:
-        return "the masks hold no object"
-    if found.larger or found.outside:
-        return "no object of the wanted size and place"
-    if found.plane is not None:
-        return "nothing stands on the plane"
-    return "no support plane and no object found"
-
-
-def _without_support(found: FrameEvidence, readings: Readings) -> str:
-    is_own = readings.labels is None and readings.camera.is_pinhole
-    return "no support plane found" if is_own and found.plane is None else ""

@@ -16,7 +16,11 @@ import numpy as np
 
 from sq_perception.fitting.fit import Fit, Parts, Status
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.cavities import Cavity
+from sq_perception.recovery.readings import Readings
+from sq_perception.segmentation.evidence import FrameEvidence
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,6 +139,53 @@ class FrameRecovery:
     def recovered(self) -> tuple[Recovery, ...]:
         """The bodies that did not fail."""
         return tuple(body for body in self.bodies if body.status != Status.FAILED)
+
+
+def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """What the recovered bodies, or their parts, would look like to the camera.
+
+    Returns
+    -------
+    depth : float64 (height, width)
+        +inf where there is no body.
+    index : int32 (height, width)
+        Position in ``frame.bodies``, -1 where there is none; failed bodies are not drawn.
+    """
+    shown = [(k, solid) for k, body in enumerate(frame.bodies) if body.status != Status.FAILED for solid in body.solids]
+    depth, index = raycast.render(Superquadric.stack([solid for _, solid in shown]), camera)
+    return depth, np.append(np.array([k for k, _ in shown], dtype=np.int32), np.int32(-1))[index]
+
+
+def what_is_left_out(readings: Readings, found: FrameEvidence, bodies: int, fragments: int) -> list[str]:
+    """Return what was seen and is not among a number of bodies, and why, in words.
+
+    ``fragments`` is the number of objects that were left out as parts of larger ones.
+    """
+    options, said = readings.options, []
+    if not bodies:
+        said.append(_why_empty(readings, found))
+    elif readings.labels is None and found.plane is None and readings.camera.is_pinhole:
+        said.append("no support plane found")
+    if found.larger:
+        objects = "1 object is" if found.larger == 1 else f"{found.larger} objects are"
+        said.append(f"{objects} larger than max_size = {options.max_size:g} m and left out")
+    if found.outside:
+        said.append(f"{found.outside} outside of the workspace left out")
+    if fragments:
+        said.append(f"{fragments} left out as part of a larger object")
+    if found.is_cut:
+        said.append(f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out")
+    return said
+
+
+def _why_empty(readings: Readings, found: FrameEvidence) -> str:
+    if not np.isfinite(readings.within_range(found.labels)).any():
+        return "the image holds no depth"
+    if readings.labels is not None and readings.labels.max() <= 0:
+        return "the masks hold no object"
+    if found.larger or found.outside:
+        return "no object of the wanted size and place"
+    return "no support plane and no object found" if found.plane is None else "nothing stands on the plane"
 
 
 @contextmanager

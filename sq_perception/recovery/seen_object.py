@@ -148,19 +148,16 @@ class SeenObject:
         heights = heights[:: max(1, heights.size // _POINTS)]
         return quantile(heights, _LOWEST), quantile(heights, 0.5)
 
-    def without(self, outliers: np.ndarray) -> SeenObject:
-        """The object without the pixels that are set in ``outliers``, bool (height, width)."""
-        return replace(self, mask=self.mask & ~outliers)
-
     def of_readings(self, depth: np.ndarray, gaps: np.ndarray, labels: np.ndarray) -> SeenObject:
         """The object in an image (height, width) that has no readings in its ``gaps``, bool (height, width)."""
         left = np.isfinite(depth[self.window]) & (labels[self.window] == self.label)
-        return replace(self.without(gaps), depth_crop=depth[self.window], pixels=int(np.count_nonzero(left)))
+        pixels = int(np.count_nonzero(left))
+        return replace(self, mask=self.mask & ~gaps, depth_crop=depth[self.window], pixels=pixels)
 
 
 def objects(depth: np.ndarray, found: FrameEvidence, camera: Camera) -> list[SeenObject]:
-    """The objects of a segmentation that have a measured pixel, in its order."""
-    measured, seen = np.isfinite(depth), []
+    """The objects of a segmentation that have a measured pixel, in its order; outliers are none of their surface."""
+    measured, outliers, seen = np.isfinite(depth), found.outliers, []
     for label in found.ids:
         named = found.labels == label
         mask = named & measured
@@ -172,7 +169,8 @@ def objects(depth: np.ndarray, found: FrameEvidence, camera: Camera) -> list[See
         pixels = int(np.count_nonzero(mask[window]))
         unread = np.flatnonzero(named ^ mask) if np.count_nonzero(named) > pixels else np.zeros(0, np.int64)
         masked, fills = pixels + len(unread), regions.fills((left, top, width, height), measured)
-        seen.append(SeenObject(label, pixels, masked, unread, mask, depth[window], camera_crop, window, fills=fills))
+        inner = mask & ~outliers
+        seen.append(SeenObject(label, pixels, masked, unread, inner, depth[window], camera_crop, window, fills=fills))
     return seen
 
 

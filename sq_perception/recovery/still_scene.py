@@ -49,9 +49,9 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.imaging.regions import window as window_of
 from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.recovery.recoverer import Readings, Recoverer
+from sq_perception.recovery.readings import Readings
+from sq_perception.recovery.recoverer import Found, Recoverer
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation.evidence import FrameEvidence
 
 _WIDTH = 320
@@ -168,7 +168,7 @@ def follow(recoverer: Recoverer, readings: Readings, last: Reference | None) -> 
             last, recovery=replace(last.recovery, bodies=bodies, milliseconds=milliseconds), age=last.age + 1
         )
     found = recoverer.find_objects(readings, kept.segmentation)
-    same = {} if last is None else match(kept, last.recovery.labels, found.objects)
+    same = {} if last is None else match(kept, last.recovery.labels, found)
     recovery = recoverer.recover_objects(readings, found, same)
     age = 0 if last is None or kept.segmentation is None else last.age + 1
     new = Reference(
@@ -248,14 +248,15 @@ def _compare(
     return None if share > _SHARED else (change, patches, level, share)
 
 
-def match(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -> dict[int, Recovery]:
+def match(kept: Repeated, labels: np.ndarray, found: Found) -> dict[int, Recovery]:
     """The repeated bodies of a new frame's objects, by their new labels.
 
     ``labels`` are those of the frame before; a body whose object is segmented otherwise now is left out.
     """
     same: dict[int, Recovery] = {}
-    for obj in objects if kept.bodies else ():
-        inside = labels[obj.window][obj.mask_crop]
+    for obj in found.objects if kept.bodies else ():
+        is_own = (found.segmentation.labels[obj.window] == obj.label) & np.isfinite(obj.depth_crop)
+        inside = labels[obj.window][is_own]
         counts = np.bincount(np.maximum(inside, 0))
         counts[0] = 0
         label = int(counts.argmax())

@@ -41,7 +41,7 @@ class FrameEvidence:
         The probability, by ``ids``, that each is a thing; empty: 1, as for labels given from outside.
     membership : float32 (height, width) or None
         The probability that the reading of a pixel is of the object whose label it has; None: 1.
-    same : (n, n) or None
+    affinity : (n, n) or None
         The probability, by ``ids``, that two objects are one; None: 0.
     is_cut
         Whether there were more objects than ``max_objects``.
@@ -56,7 +56,7 @@ class FrameEvidence:
     support: SupportSurface | None = None
     objectness: tuple[float, ...] = ()
     membership: np.ndarray | None = None
-    same: np.ndarray | None = None
+    affinity: np.ndarray | None = None
     is_cut: bool = False
     larger: int = 0
     outside: int = 0
@@ -83,13 +83,19 @@ class FrameEvidence:
         """The probability that each object is a thing, by its label."""
         return dict(zip(self.ids, self.objectness or (1.0,) * len(self.ids), strict=True))
 
+    def affinities(self, label: int) -> dict[int, float]:
+        """The probability that an object is one with each object of the frame, by their labels; empty: 0."""
+        if self.affinity is None:
+            return {}
+        return dict(zip(self.ids, self.affinity[self.ids.index(label)].tolist(), strict=True))
+
     def same_as_larger(self) -> dict[int, float]:
         """The greatest probability that an object is one with another of twice its pixels at least, by its label; of
         objects that have such another one."""
-        if self.same is None:
+        if self.affinity is None:
             return {}
         counts = regions.extents(self.labels)[list(self.ids), 0]
-        same = np.where(counts >= 2 * counts[:, None], self.same, 0.0).max(axis=1, initial=0.0)
+        same = np.where(counts >= 2 * counts[:, None], self.affinity, 0.0).max(axis=1, initial=0.0)
         return {label: each for label, each in zip(self.ids, same.tolist(), strict=True) if each > 0}
 
     def kept(self, likely: dict[int, float]) -> FrameEvidence:
@@ -100,9 +106,9 @@ class FrameEvidence:
         order = sorted(likely, key=lambda label: (-counts[label], label))
         number = np.zeros(len(counts), np.int32)
         number[order] = np.arange(len(order)) + 1
-        place = [self.ids.index(label) for label in order] if self.same is not None else []
+        place = [] if self.affinity is None else [self.ids.index(label) for label in order]
         return replace(
             self, labels=regions.renumber(self.labels, number), ids=tuple(range(1, len(order) + 1)),
             objectness=tuple(likely[label] for label in order),
-            same=None if self.same is None else self.same[np.ix_(place, place)],
+            affinity=None if self.affinity is None else self.affinity[np.ix_(place, place)],
         )

@@ -21,7 +21,7 @@ def test_it_is_less_likely_the_more_it_is_one_with_another_and_the_worse_its_bod
 def test_only_much_larger_objects_have_fragments():
     labels = np.repeat(np.array([1, 1, 1, 2, 2, 3], np.int32), 10)[None]
     same = np.array([[0, 0.4, 0.3], [0.4, 0, 0.2], [0.3, 0.2, 0]])
-    assert FrameEvidence(labels, (1, 2, 3), same=same).same_as_larger() == {3: 0.3}
+    assert FrameEvidence(labels, (1, 2, 3), affinity=same).same_as_larger() == {3: 0.3}
     assert FrameEvidence(labels, (1, 2, 3)).same_as_larger() == {}, "no network said anything"
 
 
@@ -37,7 +37,7 @@ def test_a_fragment_is_no_body_and_has_no_pixels(same, is_kept):
     pairs = np.array([[0.0, same], [same, 0.0]])
     chain = Recoverer(method="symmetry", threads=1)
     readings = chain.read(depth, VGA)
-    found = chain.find_objects(readings, FrameEvidence(labels, (1, 2), same=pairs))
+    found = chain.find_objects(readings, FrameEvidence(labels, (1, 2), affinity=pairs))
     recovery = chain.recover_objects(readings, found)
     assert [body.label for body in recovery.bodies] == ([1, 2] if is_kept else [1])
     assert (recovery.labels == 2).any() == is_kept

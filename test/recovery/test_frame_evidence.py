@@ -47,7 +47,7 @@ def test_what_lies_within_the_body_and_what_is_surely_another_add_nothing() -> N
 def test_pairs_keep_their_probability_when_others_go() -> None:
     labels = np.repeat(np.array([[1, 1, 1, 2, 2, 3]], np.int32), 4, axis=0)
     same = np.array([[0, 0.1, 0.2], [0.1, 0, 0.3], [0.2, 0.3, 0]])
-    found = FrameEvidence(labels, (1, 2, 3), same=same).kept({3: 0.9, 2: 0.8})
+    found = FrameEvidence(labels, (1, 2, 3), affinity=same).kept({3: 0.9, 2: 0.8})
     assert found.ids == (1, 2)
-    assert found.same is not None
-    assert found.same[0, 1] == found.same[1, 0] == 0.3
+    assert found.affinity is not None
+    assert found.affinity[0, 1] == found.affinity[1, 0] == 0.3
