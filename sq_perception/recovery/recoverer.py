@@ -49,9 +49,8 @@ from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.readings import Readings, read
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, render_recovery, timed, what_is_left_out
 from sq_perception.recovery.seen_object import Prediction, SeenObject
-from sq_perception.segmentation import segments
+from sq_perception.segmentation import objectness, segments
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.objectness import LEAST_OF_ITS_OWN, of_its_own
 
 __all__ = [
     "FrameRecovery",
@@ -212,15 +211,15 @@ class Recoverer:
             with timed(milliseconds, "score"):
                 scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], readings.options), range(len(fresh)))
         evidence = found.segmentation
-        likely, fragments = evidence.likely(), []
-        same = evidence.same_as_larger()
+        likely, fragments, fewest = evidence.likely(), [], segments.least_pixels(evidence.labels.size)
         for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True):
-            is_judged = obj.label in same and fit.status != Status.FAILED
-            own = of_its_own(same[obj.label], score) if is_judged else 1.0
-            if own < LEAST_OF_ITS_OWN:
-                fragments.append(obj.label)
-                continue
-            thing = min(own, likely[obj.label])
+            thing = likely[obj.label]
+            if evidence.membership is not None and fit.status != Status.FAILED:
+                uncertainty = float(np.max(fit.sigma_size / fit.superquadric.size))
+                thing = objectness.probability_with_body(thing, uncertainty, obj.pixels / fewest)
+                if thing < objectness.LEAST_WITH_BODY:
+                    fragments.append(obj.label)
+                    continue
             cavity = find_cavity(obj, (fit,) if some is None else some.fits) if readings.options.parts else None
             bodies[obj.label] = Recovery(fit, score, obj.label, obj.pixels, thing, parts=some, cavity=cavity)
         recovered = tuple(bodies[obj.label] for obj in found.objects if obj.label in bodies)

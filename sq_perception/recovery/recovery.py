@@ -159,7 +159,7 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
 def what_is_left_out(readings: Readings, found: FrameEvidence, bodies: int, fragments: int) -> list[str]:
     """Return what was seen and is not among a number of bodies, and why, in words.
 
-    ``fragments`` is the number of objects that were left out as parts of larger ones.
+    ``fragments`` is the number of objects that were left out by their bodies.
     """
     options, said = readings.options, []
     if not bodies:
@@ -172,7 +172,7 @@ def what_is_left_out(readings: Readings, found: FrameEvidence, bodies: int, frag
     if found.outside:
         said.append(f"{found.outside} outside of the workspace left out")
     if fragments:
-        said.append(f"{fragments} left out as part of a larger object")
+        said.append(f"{fragments} left out, each a fragment of an object or of the background by its body")
     if found.is_cut:
         said.append(f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out")
     return said

@@ -1,8 +1,8 @@
 """What one frame shows: its objects, how surely a pixel is of which, and the support with the noise about it.
 
-The segmentation makes it, and the stages behind it read it: views and fits the membership of pixels, supports the
-plane, repeated frames the noise, deviations of sizes the pairs of objects that may be one, and with the score of its
-body these say whether an object is a fragment.  docs/segmentation.md derives the probabilities and what they are worth.
+The segmentation makes it, and the stages behind it read it: views, fits and scores the membership of pixels, supports
+the plane, repeated frames the noise, deviations of sizes the pairs of objects that may be one.  docs/segmentation.md
+derives the probabilities and what they are worth.
 
 Metres and pixels.
 """
@@ -88,15 +88,6 @@ class FrameEvidence:
         if self.affinity is None:
             return {}
         return dict(zip(self.ids, self.affinity[self.ids.index(label)].tolist(), strict=True))
-
-    def same_as_larger(self) -> dict[int, float]:
-        """The greatest probability that an object is one with another of twice its pixels at least, by its label; of
-        objects that have such another one."""
-        if self.affinity is None:
-            return {}
-        counts = regions.extents(self.labels)[list(self.ids), 0]
-        same = np.where(counts >= 2 * counts[:, None], self.affinity, 0.0).max(axis=1, initial=0.0)
-        return {label: each for label, each in zip(self.ids, same.tolist(), strict=True) if each > 0}
 
     def kept(self, likely: dict[int, float]) -> FrameEvidence:
         """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""

@@ -11,11 +11,13 @@ Equation
 l is the median over the segment's pixels of the logit by which a network says that they are of one object
 (:mod:`sq_perception.recovery.own_segments`).  s is measured on the support itself, by blocks of its pixels: it holds
 what the sensor's noise leaves of a mean of so many correlated readings, and the waves of a bent depth, which no mean
-removes.  a, b, c are those of a logistic regression (see ``_WEIGHTS``).  A fragment of a thing rises as well; what
-tells it is its finished body.  With q the greatest probability, by the same network, that it is one with a segment of
-twice its pixels or more, and the score of the body,
+removes.  a, b, c are those of a logistic regression (see ``_WEIGHTS``).
 
-    logit P(of its own) = a' log(q / (1 - q)) + b' score + c'
+A fragment of a thing rises and looks like one as well; its finished body tells.  With p the probability above, u the
+largest standard deviation of a half size over that half size, 1 at most, and n the segment's pixels over the fewest
+that a segment has,
+
+    logit P(thing | body) = a' logit p + b' log u + c' log n + d'
 
 Heights and deviations in metres as at one metre of depth.
 """
@@ -39,10 +41,11 @@ _UNASKED = 3.4
 """l of a segment that no network was asked about: what rises by six deviations is then a thing."""
 LEAST = 0.2
 """What is less likely a thing is left out: a thing that is missed costs as much as four bodies of nothing."""
-_OF_ITS_OWN = (-0.83, 5.0, -3.9)
-"""a', b', c', a regression on bodies of simulated scenes (benchmarks/household_things, seeds from 50 000)."""
-LEAST_OF_ITS_OWN = 0.35
-"""What is less likely a thing of its own is left out with its body."""
+_BODY_WEIGHTS = (0.65, -0.75, 0.95, -1.3)
+"""a', b', c', d', a regression on bodies of benchmarks/household_things (seeds from 60 000).  The score of the body, the
+affinity to larger segments, contact with them, and what hides the segment add nothing to it."""
+LEAST_WITH_BODY = 0.35
+"""What is less likely a thing is left out with its body; chosen on seeds from 64 000."""
 _BLOCKS = (4, 32)
 """Pixels a side of the smallest and the largest block of the support."""
 _SUPPORT = 0.03
@@ -94,12 +97,11 @@ def logit(rise: float, of_one_object: float = _UNASKED) -> float:
     return a * of_one_object + b * math.log(min(max(rise, 0.1), _MOST_SURE)) + c
 
 
-def of_its_own(same: float, score: float) -> float:
-    """The probability that a segment is no fragment of a larger one, by the probability that both are one and the score
-    of its body."""
-    a, b, c = _OF_ITS_OWN
-    q = min(max(same, 2e-3), 1 - 2e-3)
-    return probability(a * math.log(q / (1 - q)) + b * score + c)
+def probability_with_body(prior: float, uncertainty: float, pixels: float) -> float:
+    """The probability that a segment is a thing, given p, u (NaN: 1) and n above."""
+    a, b, c, d = _BODY_WEIGHTS
+    p, u = min(prior, 0.999), min(1.0, max(uncertainty, 1e-3))  # NaN is no less than 1
+    return probability(a * math.log(p / (1 - p)) + b * math.log(u) + c * math.log(pixels) + d)
 
 
 def probability(log_odds: float) -> float:

@@ -1,4 +1,4 @@
-"""A fragment of a thing is left out once its body is known; a thing of its own beside another one is not."""
+"""A fragment of a thing is left out once its body is known, and that is said; a thing beside another one is not."""
 
 from __future__ import annotations
 
@@ -7,38 +7,36 @@ import pytest
 from table_scenes import VGA, Table
 
 from sq_perception.recovery.recoverer import Recoverer
-from sq_perception.segmentation import objectness
 from sq_perception.segmentation.evidence import FrameEvidence
+from sq_perception.segmentation.objectness import probability_with_body
 
 
-def test_it_is_less_likely_the_more_it_is_one_with_another_and_the_worse_its_body_is():
-    by_pair = [objectness.of_its_own(same, 0.7) for same in (0.0, 0.1, 0.4, 0.49)]
-    by_score = [objectness.of_its_own(0.3, score) for score in (0.1, 0.4, 0.9)]
-    assert by_pair == sorted(by_pair, reverse=True)
-    assert by_score == sorted(by_score)
+def test_a_thing_is_likelier_the_likelier_it_was_the_surer_its_size_and_the_more_of_it_is_seen():
+    by_prior = [probability_with_body(prior, 0.3, 2.0) for prior in (0.2, 0.5, 0.9, 1.0)]
+    by_size = [probability_with_body(0.5, uncertainty, 2.0) for uncertainty in (1.0, 0.3, 0.1, 0.0)]
+    by_pixels = [probability_with_body(0.5, 0.3, pixels) for pixels in (1.0, 2.0, 20.0)]
+    for each in (by_prior, by_size, by_pixels):
+        assert 0 < each[0] < each[-1] < 1
+        assert each == sorted(each)
+    assert probability_with_body(0.5, np.nan, 2.0) == by_size[0], "of which nothing is known"
 
 
-def test_only_much_larger_objects_have_fragments():
-    labels = np.repeat(np.array([1, 1, 1, 2, 2, 3], np.int32), 10)[None]
-    same = np.array([[0, 0.4, 0.3], [0.4, 0, 0.2], [0.3, 0.2, 0]])
-    assert FrameEvidence(labels, (1, 2, 3), affinity=same).same_as_larger() == {3: 0.3}
-    assert FrameEvidence(labels, (1, 2, 3)).same_as_larger() == {}, "no network said anything"
-
-
-@pytest.mark.parametrize(("same", "is_kept"), [(0.0, True), (0.499, False)])
-def test_a_fragment_is_no_body_and_has_no_pixels(same, is_kept):
-    """The face of a box, less a strip of it, and that strip, whose body explains little of its view."""
+@pytest.mark.parametrize(("likely", "is_kept"), [(0.9, True), (0.2, False)])
+def test_a_fragment_is_no_body_has_no_pixels_and_is_said(likely, is_kept):
+    """The face of a box, less a strip of it, and that strip, whose body has no depth."""
     table = Table(pitch=0.9)
     depth, truth = table.see([table.body(0.0, 0.0, (0.06, 0.05, 0.05))], 1e-3)
     columns = np.flatnonzero((truth == 1).any(axis=0))
     labels = truth.astype(np.int32)
     strip = np.arange(depth.shape[1]) < columns[0] + 4
     labels[(truth == 1) & strip] = 2
-    pairs = np.array([[0.0, same], [same, 0.0]])
+    evidence = FrameEvidence(labels, (1, 2), objectness=(0.99, likely), membership=np.ones(labels.shape, np.float32))
     chain = Recoverer(method="symmetry", threads=1)
     readings = chain.read(depth, VGA)
-    found = chain.find_objects(readings, FrameEvidence(labels, (1, 2), affinity=pairs))
-    recovery = chain.recover_objects(readings, found)
+    recovery = chain.recover_objects(readings, chain.find_objects(readings, evidence))
     assert [body.label for body in recovery.bodies] == ([1, 2] if is_kept else [1])
+    assert ("1 left out, each a fragment" in recovery.message) != is_kept
     assert (recovery.labels == 2).any() == is_kept
     assert (recovery.labels == 1).sum() == (labels == 1).sum()
+    given = chain.recover(depth, VGA, labels).bodies
+    assert [body.objectness for body in given] == [1.0, 1.0], "masks from outside are not judged"
