@@ -67,11 +67,12 @@ def support(
         return top
     if not behind and -reach <= low < _HOVERING:
         return found.plane
-    other = segments.support_under(found, obj.label, depth, camera, options)
+    depth, valid = segments.measured(depth, camera, options.depth_range)
+    other = support_plane.around(found.labels, (obj.label,), depth, valid, camera, found.plane)
     if other is not None:
-        lowest, middle = obj.levels(other)
+        lowest, middle = obj.levels(other.equation)
         if abs(lowest) < _HOVERING and middle > 0:
-            return other
+            return other.equation
     if behind or low < -reach or low > _HIGHEST_STACK:
         return None
     is_held = low > _NOT_ON_IT and _is_held(obj, low, depth, camera, found.labels, found.plane)

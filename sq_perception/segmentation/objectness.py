@@ -42,8 +42,8 @@ _UNASKED = 3.4
 LEAST = 0.2
 """What is less likely a thing is left out: a thing that is missed costs as much as four bodies of nothing."""
 _BODY_WEIGHTS = (0.65, -0.75, 0.95, -1.3)
-"""a', b', c', d', a regression on bodies of benchmarks/household_things (seeds from 60 000).  The score of the body, the
-affinity to larger segments, contact with them, and what hides the segment add nothing to it."""
+"""a', b', c', d', a regression on bodies of benchmarks/household_things (seeds from 60 000).  The score of the body,
+the affinity to larger segments, contact with them, and what hides the segment add nothing to it."""
 LEAST_WITH_BODY = 0.35
 """What is less likely a thing is left out with its body; chosen on seeds from 64 000."""
 _BLOCKS = (4, 32)

@@ -4,8 +4,8 @@ Steps
 -----
 1. The support plane, bent as the sensor bends it (:mod:`sq_perception.segmentation.support_plane`), and what is clearly
    above it.
-2. Components of it that no depth step cuts, taken apart where lines of sight within them cross empty space, and joined
-   where none between them does (:mod:`sq_perception.segmentation.bodies`).
+2. Components of it that no depth step cuts, taken apart where lines of sight within them cross empty space, joined
+   where none between them does (:mod:`sq_perception.segmentation.convex_parts`), and continued down to their foot.
 3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
    than the noise, it was taken for a part of the segment (:mod:`sq_perception.segmentation.level_faces`).
 4. Walls of a bin or a tray around things go (:mod:`sq_perception.segmentation.container_walls`).
@@ -29,12 +29,14 @@ from itertools import islice
 import cv2
 import numpy as np
 
+from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import bodies, container_walls, convex_parts, level_faces, objectness, support_plane
-from sq_perception.segmentation.evidence import UNKNOWN_SIGMA, FrameEvidence
+from sq_perception.segmentation import container_walls, convex_parts, level_faces, objectness, support_plane
+from sq_perception.segmentation.evidence import LEAST_SIGMA, UNKNOWN_SIGMA, FrameEvidence
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, LARGEST_THING, POINTS, SegmentationOptions, largest_edge
+from sq_perception.segmentation.support_plane import CLEARLY, TOLERANCE, SupportSurface
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m."""
@@ -42,6 +44,17 @@ _SIDE_MEASURED = 0.6
 """Share of a side of the readings' box from which on they go on beyond it: a silhouette touches it here and there."""
 _LEAST_PIECE = 0.02
 """Share of a silhouette no larger than a thing that one of several things in it has at least."""
+_WIDE = 9
+"""Pixels a side of the windows by whose means low things are told from noise."""
+_LEAST_AREA = 1e-4
+"""Least area of a component without a step in it, square metres across the line of sight."""
+_MOST = 128
+"""Components, and segments, that are looked at: bounds the time of frames that are noise alone."""
+_GROWN = 3
+"""Pixels that components grow by: those beside a step, where they are narrow, and down to the foot of a thing."""
+_GAP = 0.1
+"""Share of the depth by which pixels of a surface with steps in it differ at most: what lies behind a fringe is
+farther."""
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> FrameEvidence:
@@ -69,15 +82,15 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
 
 def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> FrameEvidence:
     """Segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
-    depth, valid = _checked(depth, camera, depth_range)
+    depth, valid = measured(depth, camera, depth_range)
     least = least_pixels(depth.size)
     if not camera.is_pinhole:
         return _ordered(FrameEvidence(depth_steps.components(valid)), least)
     if np.count_nonzero(valid) < least:
         return FrameEvidence(np.zeros(depth.shape, np.int32))
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
-    is_silhouette = _is_silhouette(valid)
-    if is_silhouette and _size(valid, known, camera) <= LARGEST_THING:
+    is_silhouette, seen = _is_silhouette(valid), np.nonzero(valid)
+    if is_silhouette and largest_edge(regions.some_points(*seen, known, camera, POINTS)) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera)
@@ -85,7 +98,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
         return _without_support(known, valid, camera, least)
     support = support_plane.measured(plane, known, valid, camera)
     relative = support.image_relative(known, camera)
-    labels = bodies.above(known, camera, relative, valid, support)
+    labels = _raised(known, camera, relative, valid, support)
     tops = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(tops, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, camera, least)
@@ -108,7 +121,7 @@ def judged(found: FrameEvidence) -> FrameEvidence:
 
 def limited(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> FrameEvidence:
     """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
-    depth, valid = _checked(depth, camera, options.depth_range)
+    depth, valid = measured(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
     larger, outside = set(), set()
     extents = regions.extents(found.labels)
@@ -154,7 +167,7 @@ def from_labels(
     if labels.ndim != 2:
         raise ValueError(f"labels: expected shape (height, width), got {labels.shape}")
     camera.check_image(labels)
-    depth, valid = _checked(depth, camera, options.depth_range)
+    depth, valid = measured(depth, camera, options.depth_range)
     labels = np.maximum(labels, 0).astype(np.int32)
     inside = np.flatnonzero(valid & (labels > 0))  # of a table with few things, few pixels: these are sorted
     values, counts = np.unique(labels.flat[inside], return_counts=True)
@@ -176,22 +189,6 @@ def least_pixels(size: int) -> int:
     return max(_LEAST_PIXELS, round(_LEAST_SHARE * size))
 
 
-def support_under(
-    found: FrameEvidence, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
-) -> np.ndarray | None:
-    """The plane (4,) that the surroundings of one object show below it; None if they show none but the segmentation's.
-
-    For objects that do not stand on that one: a frame may show a table, a shelf and the floor.  ``depth`` and
-    ``camera`` are those of the segmentation.
-    """
-    options = options or SegmentationOptions()
-    depth, valid = _checked(depth, camera, options.depth_range)
-    if not camera.is_pinhole or not ((found.labels == label) & valid).any():
-        return None
-    around = support_plane.around(found.labels, (label,), depth, valid, camera, found.plane)
-    return None if around is None else around.equation
-
-
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by a ball on a table, beside a hole, and by two that touch."""
     convex_parts.warm_up()
@@ -202,7 +199,8 @@ def warm_up() -> None:
     segment(np.where(np.abs(radius - 1.2) < 0.1, np.float32(np.nan), depth), camera)
 
 
-def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+def measured(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """The depth, float32, and where it is a measurement within limits."""
     depth = camera.readings(depth).astype(np.float32, copy=False)
     near, far = limits
     valid = np.isfinite(depth) if np.isinf(far) else depth <= far
@@ -211,11 +209,6 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     if near > 0 or not camera.is_pinhole:
         valid &= depth >= near
     return depth, valid
-
-
-def _size(valid: np.ndarray, depth: np.ndarray, camera: Camera) -> float:
-    rows, columns = np.nonzero(valid)
-    return largest_edge(regions.some_points(rows, columns, depth, camera, POINTS))
 
 
 def _is_silhouette(valid: np.ndarray) -> bool:
@@ -228,11 +221,11 @@ def _is_silhouette(valid: np.ndarray) -> bool:
 
 def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least: int) -> FrameEvidence:
     """The segments of an image that shows no support plane, but those that fill it, as a wall does."""
-    labels = bodies.taken_apart(known, valid, camera, UNKNOWN_SIGMA)
+    labels = taken_apart(known, valid, camera, UNKNOWN_SIGMA)
     found = _ordered(FrameEvidence(labels), least)
-    extents = regions.extents(found.labels)[:, [3, 1, 4, 2]]
-    boxes = {k: (extents[k, 0], extents[k, 1], *(extents[k, 2:] - extents[k, :2])) for k in found.ids}
-    return found.kept({k: 1.0 for k, box in boxes.items() if _is_silhouette(valid) or not regions.fills(box, valid)})
+    if _is_silhouette(valid):
+        return found
+    return found.kept({k: 1.0 for k in found.ids if not regions.fills(regions.box(found.labels == k), valid)})
 
 
 def _unloaded(
@@ -241,7 +234,7 @@ def _unloaded(
     """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
     relative = face.surface.image_relative(known, camera)
     valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    parts = _ordered(FrameEvidence(bodies.above(known, camera, relative * valid, valid, face.surface)), least)
+    parts = _ordered(FrameEvidence(_raised(known, camera, relative * valid, valid, face.surface)), least)
     heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.surface.sigma)
     parts = judged(replace(parts, heights=heights))
     return np.where(parts.labels > 0, parts.labels + labels.max(), labels)
@@ -252,5 +245,88 @@ def _ordered(found: FrameEvidence, least: int) -> FrameEvidence:
     counts = regions.extents(found.labels)[:, 0]
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
-    most = bodies.MOST
-    return replace(found, is_cut=len(order) > most).kept(dict.fromkeys(order[:most].tolist(), 1.0))
+    return replace(found, is_cut=len(order) > _MOST).kept(dict.fromkeys(order[:_MOST].tolist(), 1.0))
+
+
+def _raised(
+    known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
+) -> np.ndarray:
+    """Bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
+
+    ``known`` and ``relative`` (height, width) are depth, and height above the support as at one metre of depth, both 0
+    where nothing is looked for; ``valid`` is where something is.
+    """
+    labels = np.zeros(known.shape, np.int32)
+    clear = cv2.blur(relative, (3, 3)) > support.clear_height
+    # The mean beside a tall body is that of its height: the pixel itself decides there.
+    raised = relative > 0.5 * support.clear_height
+    above_noise, low = _low(relative, valid, support.clear_height)
+    clear = (clear & raised) | low
+    raised |= above_noise
+    left, top, width, height = regions.box(clear)
+    if width == 0:
+        return labels
+    reach = _GROWN + 1
+    top, left = max(top - reach, 0), max(left - reach, 0)
+    window = slice(top, top + height + 2 * reach), slice(left, left + width + 2 * reach)
+    # Contiguous, as kernels are compiled for arrays of a kind.
+    known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
+    camera = camera.cropped(left, top, known.shape[1], known.shape[0])
+    inside = taken_apart(known, clear, camera, support.sigma)
+    foot = raised[window] & (inside == 0)
+    labels[window] = depth_steps.grow(inside, foot, known, _GROWN, depth_steps.STEP)
+    return labels
+
+
+def _low(relative: np.ndarray, valid: np.ndarray, clear_height: float) -> tuple[np.ndarray, np.ndarray]:
+    """What single readings hide in their noise, as pixels (height, width): those above the support by the median of
+    their neighbours, and of them those that the mean of a wide window shows to be clearly above it.
+
+    The deviation of such means is that of windows side by side on the support, which is most of what is not clearly
+    above it: it holds what correlated noise and waves of the depth leave of a mean.
+    """
+    # What is higher counts as if it were just clear, so that tall bodies do not raise what is beside them.
+    wide = cv2.blur(np.minimum(relative, clear_height), (_WIDE, _WIDE))
+    rows, columns = (length // _WIDE for length in valid.shape)
+    apart = slice(_WIDE // 2, None, _WIDE)
+    is_full = valid[: rows * _WIDE, : columns * _WIDE].reshape(rows, _WIDE, columns, _WIDE).all(axis=(1, 3))
+    means = np.abs(wide[apart, apart][:rows, :columns])[is_full]
+    means = means[means < clear_height]
+    if not means.size:
+        return np.zeros(valid.shape, bool), np.zeros(valid.shape, bool)
+    height = max(0.5 * TOLERANCE, CLEARLY * MEDIAN_TO_SIGMA * quantile(means, 0.5))
+    near = valid & (cv2.medianBlur(relative, 3) > 0.5 * height)
+    return near, near & (wide > height)
+
+
+def taken_apart(depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
+    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and by lines of sight."""
+    labels = _components(depth, wanted, camera)
+    return convex_parts.corrected(labels, depth, camera, max(sigma, LEAST_SIGMA))
+
+
+def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.ndarray:
+    """Labels (height, width) of the wanted pixels, cut at depth steps, without bits; what a sensor smeared over a step
+    is a bridge of few pixels, and does not connect."""
+    filled = cv2.copyTo(depth, wanted.view(np.uint8))  # and 0 elsewhere
+    some = filled[::4, ::4]
+    some = some[some > 0]
+    if some.size == 0:
+        return np.zeros(depth.shape, np.int32)
+    least = _LEAST_AREA * camera.fx * camera.fy / quantile(some, 0.5) ** 2
+    inner = (wanted & ~depth_steps.edges(filled, wanted, depth_steps.STEP)).view(np.uint8)
+    labels = _large(depth_steps.components(cv2.morphologyEx(inner, cv2.MORPH_OPEN, depth_steps.CROSS)), least)
+    labels = depth_steps.grow(labels, wanted & (labels == 0), depth, _GROWN, depth_steps.STEP)
+    left = wanted & (labels == 0)
+    if np.count_nonzero(left) < least:
+        return labels
+    # A side that is seen at a grazing angle has steps all over, but all one way.
+    steep = _large(depth_steps.separate(depth, left, _GAP), least)
+    return np.where(steep > 0, steep + labels.max(), labels)
+
+
+def _large(labels: np.ndarray, least: float) -> np.ndarray:
+    """The labels with at least so many pixels, or the largest of them if there are very many, renumbered from 1."""
+    counts = regions.extents(labels)[:, 0]
+    kept = counts >= max(least, np.sort(counts)[-_MOST:][0])
+    return regions.renumber(labels, (kept * np.cumsum(kept)).astype(np.int32))

@@ -11,10 +11,9 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
-from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.options import SegmentationOptions
-from sq_perception.segmentation.segments import from_labels, segment, support_under
-from sq_perception.segmentation.support_plane import Plane, flat
+from sq_perception.segmentation.segments import from_labels, segment
+from sq_perception.segmentation.support_plane import around
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 
@@ -291,9 +290,9 @@ def test_another_support_is_sought_where_the_surroundings_show_one():
     depth = np.where(on_shelf, np.fmin(depth, table_depth(plane=shelf)), depth).astype(np.float32)
     labels[(labels == 2) & (depth < table_depth(plane=shelf) - 1e-3)] = 3
     labels[labels == 2] = 0
-    found = FrameEvidence(labels, (1, 3), flat(Plane(PLANE, 1.0, 1e-3)))
-    np.testing.assert_allclose(support_under(found, 3, depth, CAMERA), shelf, atol=2e-3)
-    assert support_under(found, 1, depth, CAMERA) is None
+    on_shelf, on_table = (around(labels, (k,), depth, np.isfinite(depth), CAMERA, PLANE) for k in (3, 1))
+    np.testing.assert_allclose(on_shelf.equation, shelf, atol=2e-3)
+    assert on_table is None
 
 
 @pytest.mark.parametrize("seed", [14, 24])

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import bodies
+from sq_perception.segmentation import segments
 
 CAMERA = Camera(320, 240, 525.0, 525.0, 159.5, 119.5)
 
 
 def taken_apart(depth, sigma=1e-3):
     depth = depth.astype(np.float32)
-    return bodies.taken_apart(depth, depth > 0, CAMERA, sigma)
+    return segments.taken_apart(depth, depth > 0, CAMERA, sigma)
 
 
 def test_a_bridge_of_two_pixels_over_a_step_does_not_connect():
