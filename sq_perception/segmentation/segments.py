@@ -92,8 +92,7 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     is_silhouette, seen = _is_silhouette(valid), np.nonzero(valid)
     if is_silhouette and largest_edge(regions.some_points(*seen, known, camera, POINTS)) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
-    planes = support_plane.planes(depth, valid, camera)
-    plane = support_plane.support(planes, depth, valid, camera)
+    plane = support_plane.support(depth, valid, camera)
     if plane is None:
         return _without_support(known, valid, camera, least)
     support = support_plane.measured(plane, known, valid, camera)

@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, deviation, quantile
+from sq_perception.geometry.quantiles import deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 
@@ -36,8 +36,8 @@ TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
 _LEAST_SHARE = 0.05
 """Share of the valid pixels that a plane has at least."""
-_PLANE_POINTS, _REFINE_POINTS = 1500, 8000
-"""On so many points planes are counted, and the best one is fitted."""
+_POINTS = 8000
+"""Points of an image that planes are fitted to."""
 _HYPOTHESES, _FEW_POINTS = 1000, 300
 """So many draws are counted on a few points."""
 _TYPICAL_HEIGHT, _FAR = 0.1, 0.1
@@ -46,8 +46,6 @@ far from all planes, it says nothing."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
-_SAMPLES = 60
-"""Samples along the shorter side of the image that the surface is fitted to."""
 CLEARLY = 4.0
 """Standard deviations of the noise from which on a height is none of it."""
 _DISTORTION = 0.02
@@ -82,11 +80,9 @@ def noise_growth(z: np.ndarray) -> np.ndarray:
     return np.maximum(z * z, LEAST_GROWTH)
 
 
-def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
-    """Up to three planes, the one with most points first; each is taken away before the next is searched."""
-    points = _some_points(depth, valid, camera, _REFINE_POINTS)
-    rng = np.random.default_rng(0)
-    total = len(points)
+def planes(points: np.ndarray) -> list[Plane]:
+    """Up to three planes of points (n, 3), the one with most of them first; each is taken away before the next."""
+    rng, total = np.random.default_rng(0), len(points)
     found: list[Plane] = []
     for _ in range(3):  # a table, the floor below it and a wall behind it
         if len(points) < max(12, _LEAST_SHARE * total):
@@ -96,33 +92,33 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
             break
         near = points[inside]
         spread = np.abs(near @ plane[:3] + plane[3]) / noise_growth(near[:, 2])
-        found.append(Plane(plane, float(inside.sum() / total), float(MEDIAN_TO_SIGMA * np.median(spread))))
+        found.append(Plane(plane, float(inside.sum() / total), deviation(spread)))
         points = points[~inside]
     return found
 
 
-def support(
-    candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camera: Camera,
-) -> Plane | None:
-    """The plane that things stand on, of some planes of an image; None if there are none.
+def support(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> Plane | None:
+    """The plane that things stand on; None if there is none.
 
     The support has many points, and a normal that points up in the image.  The camera is mounted upright or looks
     straight down; a table seen from straight above has the normal of a wall, so that such planes count as well, though
     less: where there is a wall, a floor or a table in the same image has a normal that points up.  What stands on a
-    support begins right above it.
+    support begins right above it: of the points on no plane, the mean of exp(-h / typical height) is large.
 
     Parameters
     ----------
-    candidates
-        As by :func:`planes`.
     depth, valid : (height, width)
         Metres, and where they are a measurement.
     """
+    points = some_points(depth, valid, camera)
+    candidates = planes(points)
     if not candidates:
         return None
-    points = _some_points(depth, valid, camera, _PLANE_POINTS)
-    near = _nearness(candidates, points)
-    return max(zip(candidates, near, strict=True), key=lambda each: _vote(each[0]) * each[1] ** 2)[0]
+    heights = np.stack([plane.height(points) for plane in candidates])
+    rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
+    near = np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0).sum(axis=1) / max(rest.shape[1], 1)
+    votes = [_vote(plane) * max(each, _FAR) ** 2 for plane, each in zip(candidates, near.tolist(), strict=True)]
+    return candidates[int(np.argmax(votes))]
 
 
 def around(
@@ -155,7 +151,7 @@ def around(
             return None
     best: Plane | None = None
     best_vote = 0.0
-    for plane in planes(depth, near, camera):
+    for plane in planes(some_points(depth, near, camera)):
         contact = []
         for points in bodies:
             heights = plane.height(points) / noise_growth(points[:, 2])
@@ -168,21 +164,20 @@ def around(
     return best
 
 
-def _some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera, count: int) -> np.ndarray:
-    """Points (k, 3) of the wanted pixels; about ``count``, evenly taken, where there are more."""
+def some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.ndarray:
+    """Points (k, 3) of the wanted pixels; some thousand, evenly taken, where there are more."""
     pixels = np.flatnonzero(wanted)
-    rows, columns = np.divmod(pixels[:: max(1, pixels.size // count)], camera.width)
+    rows, columns = np.divmod(pixels[:: max(1, pixels.size // _POINTS)], camera.width)
     return camera.unproject(columns, rows, depth[rows, columns])
 
 
 def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
     """The plane (4,) with most points within the tolerance * z^2, and which points these are."""
-    few = points[:: max(1, len(points) // _PLANE_POINTS)]
-    candidates = _through_three(few, _HYPOTHESES, rng)
+    candidates = _through_three(points, rng)
     if not len(candidates):
         return None, np.zeros(len(points), bool)
-    fewer = few[:: max(1, len(few) // _FEW_POINTS)]
-    weighted = np.stack([*fewer.T, np.ones(len(fewer))]) / (TOLERANCE * noise_growth(fewer[:, 2]))
+    few = points[:: max(1, len(points) // _FEW_POINTS)]
+    weighted = np.stack([*few.T, np.ones(len(few))]) / (TOLERANCE * noise_growth(few[:, 2]))
     plane = candidates[_votes(candidates, weighted.astype(np.float32)).argmax()].astype(float)
     growth = noise_growth(points[:, 2])
     reach, weights, rows = TOLERANCE * growth, growth**-2, np.ascontiguousarray(points.T)
@@ -194,9 +189,9 @@ def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.nd
     return plane, np.abs(plane[:3] @ rows + plane[3]) < reach
 
 
-def _through_three(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Planes float32 (k, 4) through ``count`` triples of points, those on a line left out."""
-    corners = points[rng.integers(len(points), size=(count, 3))]
+def _through_three(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Planes float32 (k, 4) through random triples of points, those on a line left out."""
+    corners = points[rng.integers(len(points), size=(_HYPOTHESES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     length = np.linalg.norm(normals, axis=1)
     usable = length > 1e-9
@@ -224,15 +219,6 @@ def least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     normal = axes[:, 0]
     offset = -normal @ middle
     return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
-
-
-def _nearness(candidates: list[Plane], points: np.ndarray) -> np.ndarray:
-    """How near above each of some planes (n,) the points (m, 3) are that lie on none of them, 0 to 1."""
-    heights = np.stack([plane.height(points) for plane in candidates])
-    rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
-    if not rest.size:
-        return np.ones(len(candidates))
-    return np.maximum(np.mean(np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0), axis=1), _FAR)
 
 
 def _vote(plane: Plane) -> float:
@@ -294,9 +280,7 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    k = max(1, min(depth.shape) // _SAMPLES)
-    rows, columns = np.nonzero(valid[::k, ::k])
-    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    points = some_points(depth, valid, camera)
     z = points[:, 2]
     x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
     height = plane.height(points) / growth

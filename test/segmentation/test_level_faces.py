@@ -56,7 +56,7 @@ def supported(depth):
     """The support of an image, and its depth with 0 where there is none."""
     valid = np.isfinite(depth)
     known = np.where(valid, depth, np.float32(0))
-    return support_plane.measured(support_plane.planes(depth, valid, VGA)[0], known, valid, VGA), known
+    return support_plane.measured(support_plane.support(depth, valid, VGA), known, valid, VGA), known
 
 
 def faces(labels, known, support):

@@ -77,7 +77,7 @@ def test_the_bend_is_measured_and_a_flat_table_has_next_to_none():
     """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2), in units of z^2."""
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
-    plane = support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
+    plane = support_plane.support(depth, np.isfinite(depth), CAMERA)
     surface = support_plane.measured(plane, depth, np.isfinite(depth), CAMERA)
     expected = -bulge * CAMERA.fx**2 / (CAMERA.cx**2 + CAMERA.cy**2) / away**2
     assert surface.bend[[3, 5]] == pytest.approx([expected, expected], rel=0.15)
@@ -88,7 +88,7 @@ def test_the_bend_is_measured_and_a_flat_table_has_next_to_none():
 
 
 def plane_of(depth):
-    return support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
+    return support_plane.support(depth, np.isfinite(depth), CAMERA)
 
 
 @pytest.mark.parametrize("seed", range(3))
