@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry.quantiles import quantile
@@ -35,10 +36,9 @@ from sq_perception.imaging import canonical_view, regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.segmentation import objectness
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import LARGEST_THING, POINTS, largest_edge
+from sq_perception.segmentation.segments import judged
 
 _ONE = (0.5, -0.5)
 """k and c: of a logistic regression over pairs of segments of simulated scenes."""
@@ -59,15 +59,6 @@ class _Seen:
     window: tuple[slice, slice]
     view: SegmentView
     logits: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class _Doubt:
-    """A segment that may be several objects: the pieces (p, p) of its view, and the mean of p over each of them."""
-
-    view: SegmentView
-    pieces: np.ndarray
-    sure: np.ndarray
 
 
 _Mapped = Callable[[Callable[[Sequence[int]], list[Any]], Sequence[int]], list[Any]]
@@ -109,39 +100,22 @@ class SegmentNetwork:
             seen |= self._seen(labels, parts)
         while len(seen) > 1 and (joined := self._join(labels, seen)):
             seen |= self._seen(labels, joined)
-        likely = self._things(labels, seen, found.heights)
-        membership = np.ones(labels.shape, np.float32)
-        for label in likely:
-            window = seen[label].window
-            _write_membership(membership[window], labels[window] == label, _logits(seen[label]))
-        odds = np.maximum(_odds_of_one(labels, seen), -_CLEAREST)
-        affinity = np.triu(_probability(odds), 1)
-        found = replace(found, labels=labels, ids=tuple(seen), membership=membership, affinity=affinity + affinity.T)
-        return found.kept(likely)
-
-    def _things(
-        self, labels: np.ndarray, seen: Mapping[int, _Seen], heights: HeightEvidence | None
-    ) -> dict[int, float]:
-        """The segments that are things, and with which probability; without a support all are."""
-        if heights is None:
-            return dict.fromkeys(seen, 1.0)
-        rise = heights.rise(labels, list(seen)).tolist()
-        likely = {}
-        for z, (label, answer) in zip(rise, seen.items(), strict=True):
-            median = quantile(_logits(answer)[labels[answer.window] == label], 0.5)
-            likely[label] = objectness.probability(objectness.logit(z, median))
-        return {label: each for label, each in likely.items() if each >= objectness.LEAST}
+        membership, medians = np.ones(labels.shape, np.float32), {}
+        for label, answer in seen.items():
+            inside = labels[answer.window] == label
+            logits = answer.view.at_pixels(answer.logits, answer.window)[inside]
+            medians[label] = quantile(logits, 0.5)
+            if medians[label] >= 0 and np.count_nonzero(logits >= 0) >= MIN_PIXELS:  # most of it is the object
+                membership[answer.window][inside] = expit(logits)
+        affinity = expit(np.maximum(_odds_of_one(labels, seen), -_CLEAREST))
+        affinity = np.triu(affinity, 1) + np.triu(affinity, 1).T
+        return judged(replace(found, labels=labels, ids=tuple(seen), membership=membership, affinity=affinity), medians)
 
     def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
         """Part segments that are several objects, in ``labels``; returns the labels of all the parts."""
         doubts = {label: doubt for label, answer in seen.items() if (doubt := _doubt(answer)) is not None}
-        if not doubts:
-            return []
-        objects = self.mapped(lambda some: self._objects([doubts[label] for label in some]), list(doubts))
-        parts: list[int] = []
-        for label, each in zip(doubts, objects, strict=True):
-            parts += _cut(labels, label, seen[label], each)
-        return parts
+        objects = self.mapped(lambda some: [self._objects(seen[k].view, *doubts[k]) for k in some], list(doubts))
+        return [part for k, each in zip(doubts, objects, strict=True) for part in _cut(labels, k, seen[k], each)]
 
     def _join(self, labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
         """Join pairs that are each other's object, each segment with one other; the labels that remain of them."""
@@ -167,30 +141,22 @@ class SegmentNetwork:
         edge = largest_edge(points, None if self.plane is None else self.plane[:3])
         return edge <= self.max_size or edge > LARGEST_THING
 
-    def _objects(self, doubts: Sequence[_Doubt]) -> list[list[np.ndarray]]:
-        """For each segment, the logits (p, p), in the cells of its view, of each object that its pieces show.
+    def _objects(self, view: SegmentView, pieces: np.ndarray, sure: np.ndarray) -> list[np.ndarray]:
+        """The logits (p, p), in the cells of a segment's view, of each object that its pieces (p, p) show.
 
         The network is asked about the least sure piece first, then about pieces that no object claims.
         """
-        first = [doubt.view.of_part(doubt.pieces == doubt.sure.argmin()) for doubt in doubts]
-        answers = self._logits(first)
-        return [self._objects_of(doubt, answer) for doubt, answer in zip(doubts, answers, strict=True)]
-
-    def _objects_of(self, doubt: _Doubt, logits: np.ndarray) -> list[np.ndarray]:
-        """The logits (p, p) of each object of one segment, from those of its least sure piece."""
-        piece = int(doubt.sure.argmin())
         objects: dict[int, np.ndarray] = {}
-        claimed = np.zeros(len(doubt.sure))
-        while True:
-            claims = _means(logits, doubt.pieces)
+        claimed = np.zeros(len(sure))
+        while claimed.min() < _APART:
+            piece = int(np.lexsort((sure, claimed))[0])
+            logits = self._logits([view.of_part(pieces == piece)])[0]
+            claims = _means(logits, pieces)
             if claims[piece] >= _ITSELF and (claims[list(objects)] < _APART).all():
                 objects[piece] = logits
                 claimed = np.maximum(claimed, claims)
             claimed[piece] = 1.0
-            if claimed.min() >= _APART:
-                return list(objects.values())
-            piece = int(np.lexsort((doubt.sure, claimed))[0])
-            logits = self._logits([doubt.view.of_part(doubt.pieces == piece)])[0]
+        return list(objects.values())
 
     def _seen(self, labels: np.ndarray, chosen: Sequence[int]) -> dict[int, _Seen]:
         extents = regions.extents(labels)
@@ -217,26 +183,22 @@ class SegmentNetwork:
         return np.ascontiguousarray(np.rot90(answers, -quarters, axes=(1, 2)))
 
 
-def _probability(logits: np.ndarray) -> np.ndarray:
-    return 1 / (1 + np.exp(-logits))
-
-
-def _doubt(answer: _Seen) -> _Doubt | None:
-    """A segment of which a piece may be of something else than most of it; None for others."""
+def _doubt(answer: _Seen) -> tuple[np.ndarray, np.ndarray] | None:
+    """The pieces (p, p) of a segment's view, and the mean of p over each, if one may be of something else than most."""
     cells = (answer.view.image[..., segment_view.SEGMENT] > 0) & (answer.view.image[..., segment_view.MEASURED] > 0)
     rows, columns = np.nonzero(cells)
     if len(rows) < _LEAST_TO_PART:
         return None
-    some = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
-    sure = _means(answer.logits, some)
-    return _Doubt(answer.view, some, sure) if sure.min() < _SURE else None
+    pieces = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
+    sure = _means(answer.logits, pieces)
+    return (pieces, sure) if sure.min() < _SURE else None
 
 
-def _means(logits: np.ndarray, some: np.ndarray) -> np.ndarray:
+def _means(logits: np.ndarray, pieces: np.ndarray) -> np.ndarray:
     """The mean of p over each of some pieces, numbers (p, p)."""
-    where = some >= 0
-    number = some[where]
-    return np.bincount(number, _probability(logits[where])) / np.maximum(np.bincount(number), 1)
+    where = pieces >= 0
+    number = pieces[where]
+    return np.bincount(number, expit(logits[where])) / np.maximum(np.bincount(number), 1)
 
 
 def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.ndarray]) -> list[int]:
@@ -275,16 +237,3 @@ def _claims(labels: np.ndarray, answer: _Seen) -> np.ndarray:
     sums = np.bincount(there, np.clip(answer.logits, -_CLEAREST, _CLEAREST).ravel(), len(counts))
     counts[0] = 0
     return np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), -np.inf)
-
-
-def _logits(answer: _Seen) -> np.ndarray:
-    """The logits of p at the pixels of a segment's window."""
-    return answer.view.at_pixels(answer.logits, answer.window)
-
-
-def _write_membership(membership: np.ndarray, inside: np.ndarray, logits: np.ndarray) -> None:
-    """Write p to the pixels of a segment; not where it contradicts the segment, as most of it is the object, or nearly
-    all."""
-    count = np.count_nonzero(inside & (logits >= 0))
-    if 2 * count >= np.count_nonzero(inside) and count >= MIN_PIXELS:
-        membership[inside] = _probability(logits[inside])

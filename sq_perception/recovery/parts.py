@@ -37,7 +37,7 @@ from sq_perception.imaging import raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
 from sq_perception.segmentation import line_of_sight
-from sq_perception.segmentation.convex_parts import linked
+from sq_perception.segmentation.convex_parts import METRIC, linked
 from sq_perception.segmentation.line_of_sight import SampledImage, stride
 
 MOST_PARTS = 4
@@ -47,8 +47,6 @@ _LIMITS = (0.55, 0.35, 0.2)
 """Distances between clusters up to which they are one piece."""
 _WIDE = 0.7
 """Radius of wide discs, as a share of that of the widest one in an object."""
-_METRIC = 0.3
-"""What the metric distance adds to that between samples, at most."""
 _LEAST_SHARE = 0.03
 """Share of the object's samples that a piece has at least."""
 _THROUGH = 2.0
@@ -181,7 +179,7 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
     if some is None:
         return
     crossed, far = line_of_sight.within(some.pixels, some.points, depth, 0.0, through)
-    apart = crossed + _METRIC * far / max(far.max(), 1e-9)
+    apart = crossed + METRIC * far / max(far.max(), 1e-9)
     rows, columns = regions.pixels(labels, 1, extent)
     block = max(1, stride(len(rows), _SAMPLES) // 4)
     seen = set()

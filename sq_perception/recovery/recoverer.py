@@ -216,8 +216,8 @@ class Recoverer:
             thing = likely[obj.label]
             if evidence.membership is not None and fit.status != Status.FAILED:
                 uncertainty = float(np.max(fit.sigma_size / fit.superquadric.size))
-                thing = objectness.probability_with_body(thing, uncertainty, obj.pixels / fewest)
-                if thing < objectness.LEAST_WITH_BODY:
+                thing = objectness.posterior(thing, uncertainty, obj.pixels / fewest)
+                if thing < objectness.LEAST_POSTERIOR:
                     fragments.append(obj.label)
                     continue
             cavity = find_cavity(obj, (fit,) if some is None else some.fits) if readings.options.parts else None

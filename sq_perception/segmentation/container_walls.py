@@ -20,9 +20,10 @@ import numpy as np
 
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.segmentation.options import across
+from sq_perception.segmentation.support_plane import TOLERANCE
 
-_TOP, _AS_HIGH = 0.95, 0.008
-"""Share of a segment's points below its top, and metres by which tops of walls may differ: noise of a rim."""
+_TOP = 0.95
+"""Share of a segment's points below its top."""
 _THICK, _OUTLYING = 0.03, 0.1
 """Metres from a side of the rectangle to the inside of a wall, with its slant and noise, or a tenth of the shorter side
 where that is less; and the share of a segment's points that may lie farther in."""
@@ -48,7 +49,7 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
     axis = {label: _axis(some) for label, some in flat.items()}
     tried: list[list[int]] = []
     for top in tops.values():
-        level = [label for label, other in tops.items() if abs(other - top) < _AS_HIGH]
+        level = [label for label, other in tops.items() if abs(other - top) < TOLERANCE]
         if len(level) > 1 and level not in tried:
             tried.append(level)
             longest = max(level, key=lambda label: float(np.hypot(*axis[label])))

@@ -36,12 +36,10 @@ _SUSPICIOUS = 0.12
 """Share of crossed pairs from which on a segment may be several bodies."""
 _APART = 0.55
 """Share of crossed pairs, on average, between pieces of a segment: more than half, as between bodies that touch."""
-_METRIC = 0.3
+METRIC = 0.3
 """What the metric distance adds to that between samples, at most."""
 _INSIDE = 0.15
 """Share of a segment's samples that are insides, beyond which the segment is one vessel."""
-_LEAST_SHARE = 0.5
-"""A piece shows that share of what a body that is attached to another shows at least."""
 _AS_ONE, _BIT_AS_ONE = 0.3, 0.45
 """Share of crossed pairs below which two segments are one body; and if one is a bit, too small to be a body beside the
 other: handles and what noise broke off."""
@@ -130,7 +128,8 @@ def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tupl
 
     ``part`` are a few samples of it, ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
     """
-    if part.area < 2 * _LEAST_SHARE * least_area(part.distance):
+    least = least_area(part.distance) / 2  # of a piece: half of what a body that is attached to another shows
+    if part.area < 2 * least:
         return []
     crossed, _ = line_of_sight.within(part.pixels, part.points, image.depth, *image.limits)
     if crossed.mean() < _SUSPICIOUS:
@@ -138,9 +137,8 @@ def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tupl
     whole = image.sampled(part.label, extent, _MANY)
     assert whole is not None  # no fewer than a few
     crossed, far = line_of_sight.within(whole.pixels, whole.points, image.depth, *image.limits)
-    group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), _APART)
-    least = _LEAST_SHARE * least_area(part.distance) / whole.spacing**2
-    large = np.bincount(group) >= max(LEAST_SAMPLES, least)
+    group = linked(crossed + METRIC * far / max(far.max(), 1e-9), _APART)
+    large = np.bincount(group) >= max(LEAST_SAMPLES, least / whole.spacing**2)
     if np.count_nonzero(large) < 2:
         return []
     # What is too small for a piece joins the one that it is nearest to.

@@ -21,9 +21,6 @@ LEAST_SIGMA, UNKNOWN_SIGMA = 5e-4, 1.5e-3
 """Noise of the depth at one metre, metres: what is assumed at least, as rendered images have none, and where no support
 shows it, that of structured light (Khoshelham and Oude Elberink, Sensors 2012)."""
 
-_MEMBER = 0.5
-"""Membership from which on a pixel is an object's rather than not."""
-
 
 @dataclass(frozen=True, eq=False)
 class FrameEvidence:
@@ -77,7 +74,7 @@ class FrameEvidence:
         """Pixels (height, width) that are more probably not of the object whose label they have."""
         if self.membership is None:
             return np.zeros(self.labels.shape, bool)
-        return (self.labels > 0) & (self.membership < _MEMBER)
+        return (self.labels > 0) & (self.membership < 0.5)
 
     def likely(self) -> dict[int, float]:
         """The probability that each object is a thing, by its label."""

@@ -27,11 +27,12 @@ from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.depth_steps import STEP
+from sq_perception.segmentation.support_plane import CLEARLY
 
 LEAST_SAMPLES = 4
 """Fewest samples of a segment: six pairs."""
-_NOISE_MARGIN, _LEAST_GAP = 4.0, 0.005
-"""Standard deviations of the noise, and metres, that a crossed line lies before what was seen."""
+_LEAST_GAP = 0.005
+"""Metres that a crossed line lies before what was seen."""
 _HOLLOW = 0.5
 """Standard deviations by which the inside of a vessel lies behind its own lines, on average."""
 _LEAST_AREA, _NEAR = 1.6e-3, 0.85
@@ -92,7 +93,7 @@ class SampledImage:
     @property
     def limits(self) -> tuple[float, float]:
         """``noise`` and ``least`` by which a line is crossed."""
-        return _NOISE_MARGIN * self.sigma, _LEAST_GAP
+        return CLEARLY * self.sigma, _LEAST_GAP
 
     def sampled(self, label: int, extent: np.ndarray, count: int) -> Samples | None:
         """Some ``count`` samples of a segment; None where they are too few to say anything."""

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.special import expit, logit
 
 from sq_perception.geometry.kernels import kernel
 
@@ -44,7 +45,7 @@ LEAST = 0.2
 _BODY_WEIGHTS = (0.65, -0.75, 0.95, -1.3)
 """a', b', c', d', a regression on bodies of benchmarks/household_things (seeds from 60 000).  The score of the body,
 the affinity to larger segments, contact with them, and what hides the segment add nothing to it."""
-LEAST_WITH_BODY = 0.35
+LEAST_POSTERIOR = 0.35
 """What is less likely a thing is left out with its body; chosen on seeds from 64 000."""
 _BLOCKS = (4, 32)
 """Pixels a side of the smallest and the largest block of the support."""
@@ -91,22 +92,18 @@ class HeightEvidence:
         return z
 
 
-def logit(rise: float, of_one_object: float = _UNASKED) -> float:
-    """The log odds that a segment is a thing, of its rise z and the network's median logit l."""
+def prior(rise: float, of_one_object: float | None = None) -> float:
+    """The probability that a segment is a thing, of its rise z and the network's median logit l, if it was asked."""
     a, b, c = _WEIGHTS
-    return a * of_one_object + b * math.log(min(max(rise, 0.1), _MOST_SURE)) + c
+    median = _UNASKED if of_one_object is None else of_one_object
+    return float(expit(a * median + b * math.log(min(max(rise, 0.1), _MOST_SURE)) + c))
 
 
-def probability_with_body(prior: float, uncertainty: float, pixels: float) -> float:
-    """The probability that a segment is a thing, given p, u (NaN: 1) and n above."""
+def posterior(likely: float, uncertainty: float, pixels: float) -> float:
+    """The probability that a segment is a thing once its body is known, of p, u (NaN: 1) and n."""
     a, b, c, d = _BODY_WEIGHTS
-    p, u = min(prior, 0.999), min(1.0, max(uncertainty, 1e-3))  # NaN is no less than 1
-    return probability(a * math.log(p / (1 - p)) + b * math.log(u) + c * math.log(pixels) + d)
-
-
-def probability(log_odds: float) -> float:
-    """1 / (1 + exp(-log odds)), for all log odds."""
-    return 0.5 * (1 + math.tanh(0.5 * log_odds))
+    u = min(1.0, max(uncertainty, 1e-3))  # NaN is no less than 1
+    return float(expit(a * logit(min(likely, 0.999)) + b * math.log(u) + c * math.log(pixels) + d))
 
 
 @kernel

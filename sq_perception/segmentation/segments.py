@@ -23,6 +23,7 @@ Metres and pixels.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from itertools import islice
 
@@ -109,12 +110,14 @@ def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float]
     return replace(found, heights=HeightEvidence(relative, found.labels, support.sigma))
 
 
-def judged(found: FrameEvidence) -> FrameEvidence:
-    """Segments that are things by their heights alone: for use without a network."""
-    if found.heights is None:
-        return found
-    rise = found.heights.rise(found.labels, found.ids).tolist()
-    likely = {k: objectness.probability(objectness.logit(z)) for k, z in zip(found.ids, rise, strict=True)}
+def judged(found: FrameEvidence, medians: Mapping[int, float] | None = None) -> FrameEvidence:
+    """Segments that are things by their heights, and by the median logits of a network that saw all of them; where
+    there is no support, all."""
+    likely = dict.fromkeys(found.ids, 1.0)
+    if found.heights is not None:
+        rise = found.heights.rise(found.labels, found.ids).tolist()
+        asked = dict.fromkeys(found.ids) if medians is None else medians
+        likely = {k: objectness.prior(z, asked[k]) for k, z in zip(found.ids, rise, strict=True)}
     return found.kept({label: each for label, each in likely.items() if each >= objectness.LEAST})
 
 

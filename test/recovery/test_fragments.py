@@ -8,17 +8,17 @@ from table_scenes import VGA, Table
 
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.objectness import probability_with_body
+from sq_perception.segmentation.objectness import posterior
 
 
 def test_a_thing_is_likelier_the_likelier_it_was_the_surer_its_size_and_the_more_of_it_is_seen():
-    by_prior = [probability_with_body(prior, 0.3, 2.0) for prior in (0.2, 0.5, 0.9, 1.0)]
-    by_size = [probability_with_body(0.5, uncertainty, 2.0) for uncertainty in (1.0, 0.3, 0.1, 0.0)]
-    by_pixels = [probability_with_body(0.5, 0.3, pixels) for pixels in (1.0, 2.0, 20.0)]
+    by_prior = [posterior(prior, 0.3, 2.0) for prior in (0.2, 0.5, 0.9, 1.0)]
+    by_size = [posterior(0.5, uncertainty, 2.0) for uncertainty in (1.0, 0.3, 0.1, 0.0)]
+    by_pixels = [posterior(0.5, 0.3, pixels) for pixels in (1.0, 2.0, 20.0)]
     for each in (by_prior, by_size, by_pixels):
         assert 0 < each[0] < each[-1] < 1
         assert each == sorted(each)
-    assert probability_with_body(0.5, np.nan, 2.0) == by_size[0], "of which nothing is known"
+    assert posterior(0.5, np.nan, 2.0) == by_size[0], "of which nothing is known"
 
 
 @pytest.mark.parametrize(("likely", "is_kept"), [(0.9, True), (0.2, False)])
