@@ -69,7 +69,7 @@ RULES: dict[str, dict[str, Any]] = {
     "bodies: feet and rims (_GROWN)": {f"{_S}.segments._GROWN": 0},
     "pieces: of all": {f"{_S}.convex_parts._pieces": lambda *_: []},
     "pieces: as large near by (_NEAR)": {f"{_S}.line_of_sight._NEAR": 1e-6},
-    "pieces: nearest first (METRIC)": {f"{_S}.convex_parts.METRIC": 0.0},
+    "pieces: nearest first (_METRIC)": {f"{_S}.convex_parts._METRIC": 0.0},
     "pieces: a step of 5 mm (_LEAST_GAP)": {f"{_S}.line_of_sight._LEAST_GAP": 0.0},
     "vessels: insides and walls": {f"{_S}.convex_parts._rims": lambda *_: np.empty((0, 2), int)},
     "vessels: pieces (_with_whole_vessels)": {f"{_S}.convex_parts._with_whole_vessels": lambda group, *_: group},

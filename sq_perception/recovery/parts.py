@@ -36,9 +36,8 @@ from sq_perception.geometry.threads import one_kernel_thread
 from sq_perception.imaging import raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
-from sq_perception.segmentation import line_of_sight
-from sq_perception.segmentation.convex_parts import METRIC, linked
-from sq_perception.segmentation.line_of_sight import SampledImage, stride
+from sq_perception.segmentation.convex_parts import clustered
+from sq_perception.segmentation.line_of_sight import SampledImage
 
 MOST_PARTS = 4
 _SAMPLES = 120
@@ -174,31 +173,20 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
     depth = np.where(np.isfinite(obj.depth_crop), obj.depth_crop, np.float32(0))
     labels = (obj.mask_crop & (depth > 0)).astype(np.int32)
     extent = regions.extents(labels)[1]
-    image = SampledImage(depth, labels, obj.camera_crop, 0.0)
+    image = SampledImage(depth, labels, obj.camera_crop, 0.0, through)
     some = image.sampled(1, extent, _SAMPLES)
     if some is None:
         return
-    crossed, far = line_of_sight.within(some.pixels, some.points, depth, 0.0, through)
-    apart = crossed + METRIC * far / max(far.max(), 1e-9)
-    rows, columns = regions.pixels(labels, 1, extent)
-    block = max(1, stride(len(rows), _SAMPLES) // 4)
+    crossed, far = image.within(some)
     seen = set()
     for limit in _LIMITS:
-        group = linked(apart, limit)
-        size = np.bincount(group)
-        is_large = size >= max(4, _LEAST_SHARE * len(far))
-        if not 2 <= np.count_nonzero(is_large) <= MOST_PARTS:
-            continue
-        keep = np.flatnonzero(is_large[group])
-        group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
-        if group.tobytes() in seen:
-            continue
-        seen.add(group.tobytes())
-        shown = depth, image.focal, some.spacing, block, 0.0, through
-        piece = line_of_sight.assigned(rows, columns, some.pixels, some.z, group, int(group.max()) + 1, *shown)
-        divided = np.zeros_like(labels)
-        divided[rows, columns] = piece + 1
-        yield divided
+        group = clustered(crossed, far, limit, max(4, _LEAST_SHARE * len(far)))
+        if 0 < group.max() < MOST_PARTS and group.tobytes() not in seen:
+            seen.add(group.tobytes())
+            divided = np.zeros_like(labels)
+            for k, piece in enumerate(image.pieces(extent, some, group, _SAMPLES)):
+                divided[piece] = k + 1
+            yield divided
 
 
 def _divide_thin(obj: SeenObject) -> Iterator[np.ndarray]:

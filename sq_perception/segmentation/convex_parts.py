@@ -28,7 +28,8 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import line_of_sight
-from sq_perception.segmentation.line_of_sight import LEAST_SAMPLES, SampledImage, Samples, least_area, stride
+from sq_perception.segmentation.line_of_sight import LEAST_SAMPLES, SampledImage, Samples, least_area
+from sq_perception.segmentation.support_plane import CLEARLY
 
 _FEW, _MANY = 30, 160
 """Samples of a segment: to see whether its lines are crossed, 435 pairs, and to take it apart."""
@@ -36,7 +37,7 @@ _SUSPICIOUS = 0.12
 """Share of crossed pairs from which on a segment may be several bodies."""
 _APART = 0.55
 """Share of crossed pairs, on average, between pieces of a segment: more than half, as between bodies that touch."""
-METRIC = 0.3
+_METRIC = 0.3
 """What the metric distance adds to that between samples, at most."""
 _INSIDE = 0.15
 """Share of a segment's samples that are insides, beyond which the segment is one vessel."""
@@ -71,7 +72,8 @@ def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: floa
         From 1, in no order; of the same pixels.
     """
     # The one layout that kernels are compiled for; labels are written to.
-    image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C"), camera, sigma)
+    depth, labels = np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C")
+    image = SampledImage(depth, labels, camera, CLEARLY * sigma)
     rims = _rims(image)
     parts, origin = _part(image)
     number_of = np.arange(len(origin), dtype=np.int32)
@@ -131,28 +133,15 @@ def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tupl
     least = least_area(part.distance) / 2  # of a piece: half of what a body that is attached to another shows
     if part.area < 2 * least:
         return []
-    crossed, _ = line_of_sight.within(part.pixels, part.points, image.depth, *image.limits)
-    if crossed.mean() < _SUSPICIOUS:
+    if image.within(part)[0].mean() < _SUSPICIOUS:
         return []
     whole = image.sampled(part.label, extent, _MANY)
     assert whole is not None  # no fewer than a few
-    crossed, far = line_of_sight.within(whole.pixels, whole.points, image.depth, *image.limits)
-    group = linked(crossed + METRIC * far / max(far.max(), 1e-9), _APART)
-    large = np.bincount(group) >= max(LEAST_SAMPLES, least / whole.spacing**2)
-    if np.count_nonzero(large) < 2:
-        return []
-    # What is too small for a piece joins the one that it is nearest to.
-    keep = np.flatnonzero(large[group])
-    group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
-    group = _with_whole_vessels(group, image.is_inside(whole, group), far)
-    count = int(group.max()) + 1
-    if count < 2:
-        return []
-    rows, columns = regions.pixels(image.labels, part.label, extent)
-    block = max(1, stride(len(rows), _MANY) // 4)
-    seen = image.depth, image.focal, whole.spacing, block, *image.limits
-    chosen = line_of_sight.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
-    return [(rows[chosen == k], columns[chosen == k]) for k in range(count) if (chosen == k).any()]
+    crossed, far = image.within(whole)
+    group = clustered(crossed, far, _APART, max(LEAST_SAMPLES, least / whole.spacing**2))
+    if group.any():
+        group = _with_whole_vessels(group, image.is_inside(whole, group), far)
+    return image.pieces(extent, whole, group, _MANY) if group.any() else []
 
 
 def _with_whole_vessels(group: np.ndarray, is_inside: np.ndarray, far: np.ndarray) -> np.ndarray:
@@ -179,11 +168,11 @@ def _crossed_between(
     borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR)
     beside, behind = (each[np.ix_(names, names)] for each in borders[1:])
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
-    crossed = line_of_sight.between(*together, reach, beside > 0, image.depth, *image.limits)
+    crossed = line_of_sight.between(*together, reach, beside > 0, image.depth, image.noise, image.least)
     is_bit = np.array([part.area < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= _AS_ONE / _BIT_AS_ONE
     far = np.isinf(crossed) & ~(is_bit[:, None] & is_bit)
-    along, over = line_of_sight.hidden(*together, names, far, image.depth, image.labels, *image.limits)
+    along, over = line_of_sight.hidden(*together, names, far, image.depth, image.labels, image.noise, image.least)
     crossed[far & (along > _ALONG) & (over < _AS_ONE)] = 0.0
     for inside, wall in rims.tolist():
         vessel = np.flatnonzero(names == inside)
@@ -193,6 +182,16 @@ def _crossed_between(
             vessel = np.append(vessel, np.flatnonzero(before > _RIM * before.sum()))
             crossed[np.ix_(vessel, vessel)] = 0.0
     return crossed
+
+
+def clustered(crossed: np.ndarray, far: np.ndarray, limit: float, least: float) -> np.ndarray:
+    """Groups (n,) of samples, from 0, by whether lines between them (n, n) are crossed, and by their distance; what
+    has less than ``least`` samples joins the group that it is nearest to."""
+    group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), limit)
+    keep = np.flatnonzero(np.bincount(group)[group] >= least)
+    if not len(keep):
+        return np.zeros_like(group)
+    return np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
 
 
 def linked(distance: np.ndarray, limit: float) -> np.ndarray:

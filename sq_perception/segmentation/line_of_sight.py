@@ -25,16 +25,16 @@ import numpy as np
 
 from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.quantiles import quantile
+from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.depth_steps import STEP
-from sq_perception.segmentation.support_plane import CLEARLY
 
 LEAST_SAMPLES = 4
 """Fewest samples of a segment: six pairs."""
 _LEAST_GAP = 0.005
 """Metres that a crossed line lies before what was seen."""
-_HOLLOW = 0.5
-"""Standard deviations by which the inside of a vessel lies behind its own lines, on average."""
+_HOLLOW = 0.125
+"""Share of ``noise`` by which the inside of a vessel lies behind its own lines, on average."""
 _LEAST_AREA, _NEAR = 1.6e-3, 0.85
 """A body that shows less, square metres across the line of sight at so many metres and farther, and is attached to
 another, is a part of that; nearer, at the same angle."""
@@ -78,22 +78,18 @@ class Samples:
 
 @dataclass(frozen=True, eq=False)
 class SampledImage:
-    """Depth float32 and labels int32 (height, width), a pinhole camera, and the noise of the depth at one metre, which
-    grows with the square of the depth."""
+    """Depth float32 and labels int32 (height, width), a pinhole camera, and the ``noise`` and ``least`` by which a line
+    is crossed."""
 
     depth: np.ndarray
     labels: np.ndarray
     camera: Camera
-    sigma: float
+    noise: float
+    least: float = _LEAST_GAP
 
     @property
     def focal(self) -> float:
         return math.sqrt(self.camera.fx * self.camera.fy)
-
-    @property
-    def limits(self) -> tuple[float, float]:
-        """``noise`` and ``least`` by which a line is crossed."""
-        return CLEARLY * self.sigma, _LEAST_GAP
 
     def sampled(self, label: int, extent: np.ndarray, count: int) -> Samples | None:
         """Some ``count`` samples of a segment; None where they are too few to say anything."""
@@ -110,11 +106,29 @@ class SampledImage:
         width = distance / self.focal
         return Samples(label, np.stack([rows, columns], axis=-1), points, step * width, distance, size * width**2)
 
+    def within(self, samples: Samples) -> tuple[np.ndarray, np.ndarray]:
+        """For each pair of samples (n, n), 1 where the line between them is crossed, else 0, and their distance,
+        metres."""
+        return _within(samples.pixels, samples.points, self.depth, self.noise, self.least)
+
+    def pieces(
+        self, extent: np.ndarray, samples: Samples, group: np.ndarray, count: int
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Rows and columns of each piece of a segment, by groups (n,) of its samples, of which there are about
+        ``count``."""
+        rows, columns = regions.pixels(self.labels, samples.label, extent)
+        block = max(1, stride(len(rows), count) // 4)
+        by_group = samples.pixels, samples.z, group, int(group.max()) + 1
+        seen = self.depth, self.focal, samples.spacing, block, self.noise, self.least
+        chosen = _assigned(rows, columns, *by_group, *seen)
+        pieces = [(rows[chosen == k], columns[chosen == k]) for k in range(int(group.max()) + 1)]
+        return [piece for piece in pieces if len(piece[0])]
+
     def is_inside(self, samples: Samples, group: np.ndarray) -> np.ndarray:
         """Which groups of samples, numbers (n,) from 0, lie behind their own lines, as the inside of a vessel does."""
         gap = _gaps(samples.pixels, samples.points, self.depth, self.labels)
         means = [gap[np.ix_(group == k, group == k)].mean() for k in range(group.max() + 1)]
-        return np.array(means) > _HOLLOW * self.sigma * samples.distance**2
+        return np.array(means) > _HOLLOW * self.noise * samples.distance**2
 
 
 @inline_kernel
@@ -214,10 +228,10 @@ def hidden(
 
 
 @kernel
-def within(
+def _within(
     pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, noise: float, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """For each pair of samples (n, n), 1 where the line between them is crossed, else 0, and their distance, metres."""
+    """As :meth:`SampledImage.within`."""
     n = pixels.shape[0]
     crossed, far = np.zeros((n, n)), np.zeros((n, n))
     for i in range(n):
@@ -255,7 +269,7 @@ def _gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.
 
 
 @kernel
-def assigned(
+def _assigned(
     rows: np.ndarray, columns: np.ndarray, samples: np.ndarray, z: np.ndarray, part: np.ndarray, parts: int,
     depth: np.ndarray, focal: float, spacing: float, block: int, noise: float, least: float,
 ) -> np.ndarray:
