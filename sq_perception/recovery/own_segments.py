@@ -28,7 +28,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
 
 from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry.quantiles import quantile
@@ -37,6 +36,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.segmentation.evidence import FrameEvidence
+from sq_perception.segmentation.objectness import probability
 from sq_perception.segmentation.options import LARGEST_THING, POINTS, largest_edge
 from sq_perception.segmentation.segments import judged
 
@@ -106,8 +106,8 @@ class SegmentNetwork:
             logits = answer.view.at_pixels(answer.logits, answer.window)[inside]
             medians[label] = quantile(logits, 0.5)
             if medians[label] >= 0 and np.count_nonzero(logits >= 0) >= MIN_PIXELS:  # most of it is the object
-                membership[answer.window][inside] = expit(logits)
-        affinity = expit(np.maximum(_odds_of_one(labels, seen), -_CLEAREST))
+                membership[answer.window][inside] = probability(logits)
+        affinity = probability(np.maximum(_odds_of_one(labels, seen), -_CLEAREST))
         affinity = np.triu(affinity, 1) + np.triu(affinity, 1).T
         return judged(replace(found, labels=labels, ids=tuple(seen), membership=membership, affinity=affinity), medians)
 
@@ -198,7 +198,7 @@ def _means(logits: np.ndarray, pieces: np.ndarray) -> np.ndarray:
     """The mean of p over each of some pieces, numbers (p, p)."""
     where = pieces >= 0
     number = pieces[where]
-    return np.bincount(number, expit(logits[where])) / np.maximum(np.bincount(number), 1)
+    return np.bincount(number, probability(logits[where])) / np.maximum(np.bincount(number), 1)
 
 
 def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.ndarray]) -> list[int]:

@@ -27,10 +27,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
-from scipy.special import expit, logit
 
 from sq_perception.geometry.kernels import kernel
 
@@ -96,14 +96,19 @@ def prior(rise: float, of_one_object: float | None = None) -> float:
     """The probability that a segment is a thing, of its rise z and the network's median logit l, if it was asked."""
     a, b, c = _WEIGHTS
     median = _UNASKED if of_one_object is None else of_one_object
-    return float(expit(a * median + b * math.log(min(max(rise, 0.1), _MOST_SURE)) + c))
+    return float(probability(a * median + b * math.log(min(max(rise, 0.1), _MOST_SURE)) + c))
 
 
 def posterior(likely: float, uncertainty: float, pixels: float) -> float:
     """The probability that a segment is a thing once its body is known, of p, u (NaN: 1) and n."""
     a, b, c, d = _BODY_WEIGHTS
-    u = min(1.0, max(uncertainty, 1e-3))  # NaN is no less than 1
-    return float(expit(a * logit(min(likely, 0.999)) + b * math.log(u) + c * math.log(pixels) + d))
+    p, u = min(likely, 0.999), min(1.0, max(uncertainty, 1e-3))  # NaN is no less than 1
+    return float(probability(a * math.log(p / (1 - p)) + b * math.log(u) + c * math.log(pixels) + d))
+
+
+def probability(log_odds: Any) -> Any:
+    """1 / (1 + exp(-log odds)), of a number or an array."""
+    return 0.5 * (1 + np.tanh(0.5 * log_odds))
 
 
 @kernel
