@@ -50,7 +50,7 @@ def of_one(works: list[workers.Work]) -> dict[str, float]:
 def of_many(works: list[workers.Work], jobs: int) -> dict[str, float]:
     """The same by so many processes."""
     spent, moments = processor_time(), []
-    executor = workers.Processes(workers.Setup(None, RecoveryOptions()), jobs)
+    executor = workers.Processes(None, "auto", jobs)
     for _ in workers.recover_all(enumerate(works), executor):
         moments.append(time.perf_counter())
     for process in multiprocessing.active_children():

@@ -150,7 +150,7 @@ class RecoverRun:
             checkpoint.check(options.model)
         # First: nothing is begun with damaged weights, or before a Ctrl-C meanwhile.
         self._executor: Recoverer | workers.Processes = (
-            workers.Processes(workers.Setup(options.model, self._settings), options.jobs)
+            workers.Processes(options.model, self._settings.method, options.jobs)
             if options.jobs > 1
             else Recoverer(options.model, method=options.method)
         )

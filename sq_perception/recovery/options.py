@@ -16,7 +16,7 @@ NEEDS_NETWORK = ("auto", "network")
 
 @dataclass(frozen=True, kw_only=True)
 class RecoveryOptions(SegmentationOptions):
-    """What may change from one frame to the next.
+    """What may change from one frame to the next, beside what counts as an object.
 
     Attributes
     ----------
@@ -24,20 +24,9 @@ class RecoveryOptions(SegmentationOptions):
         See :mod:`sq_perception.recovery.recoverer`.
     sharpness, tau
         s and tau of the soft renderer, in the score.
-    depth_range
-        Nearest and farthest depth of an object, metres.
-    max_objects
-        The largest ones are recovered.
     time_budget
         Seconds per frame after which the surface fit tries no further start for any object.  Those with most pixels,
         large or near, come first.  Segments and predictions take the time that they take.
-    max_size
-        Largest full edge of an object, metres: walls, furniture and tables are larger.  Masks from outside may be, too.
-    workspace
-        The middle of what is seen of an object lies in this box, metres: least x, y, z and greatest x, y, z; None:
-        anywhere.
-    workspace_pose
-        Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
     free_space
         Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it objects are fitted as things, with a model error.

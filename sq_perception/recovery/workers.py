@@ -16,21 +16,17 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
+from typing import TypeAlias, TypeVar, cast
 
 import numpy as np
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-
-if TYPE_CHECKING:
-    from sq_perception.recovery.recoverer import Recoverer
 
 AHEAD = 3
 """Frames under way for each process: the one it works on, one that waits for it, one whose answer waits."""
@@ -48,14 +44,6 @@ class Work:
     depth: np.ndarray
     camera: Camera
     labels: np.ndarray | None
-    options: RecoveryOptions
-
-
-@dataclass(frozen=True)
-class Setup:
-    """What each process makes its Recoverer from."""
-
-    model: Path | str | None
     options: RecoveryOptions
 
 
@@ -149,7 +137,7 @@ def recover_crops(
         for depth, camera, mask in zip(depths, each, shown, strict=True)
     ]
     if jobs > 1:
-        answers = [answer for _, answer in recover_all(enumerate(works), Processes(Setup(None, settings), jobs))]
+        answers = [answer for _, answer in recover_all(enumerate(works), Processes(None, settings.method, jobs))]
     else:
         from sq_perception.recovery.recoverer import Recoverer  # here: a process that only shares work needs none
 
@@ -166,8 +154,8 @@ def recover_crops(
 class Processes:
     """``size`` processes, each asked by a thread of its own; another one begins where one died."""
 
-    def __init__(self, setup: Setup, size: int) -> None:
-        self._setup, self.size = setup, size
+    def __init__(self, model: Path | str | None, method: Method, size: int) -> None:
+        self._model, self._method, self.size = model, method, size
         self._threads, self._lock = ThreadPoolExecutor(size), threading.Lock()
         self._of_thread: dict[int, tuple[BaseProcess, Connection]] = {}
         self._ended = False
@@ -192,7 +180,7 @@ class Processes:
             if self._ended:
                 raise _LostError
             if thread not in self._of_thread:
-                self._of_thread[thread] = _start(self._setup)
+                self._of_thread[thread] = _start(self._model, self._method)
             process, pipe = self._of_thread[thread]
         try:
             pipe.send(work)
@@ -208,12 +196,12 @@ class Processes:
         return cast(FrameRecovery, answer)
 
 
-def _start(setup: Setup) -> tuple[BaseProcess, Connection]:
+def _start(model: Path | str | None, method: Method) -> tuple[BaseProcess, Connection]:
     """A process, and this end of its pipe; Ctrl-C is for the one that asks."""
     # Not forked: a process that has threads of BLAS and numba cannot be copied.
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    process = context.Process(target=_serve, args=(setup, there), daemon=True)
+    process = context.Process(target=_serve, args=(model, method, there), daemon=True)
     resource_tracker.ensure_running()  # whose start would let the signal through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the process inherits it, and has it at once
     try:
@@ -224,32 +212,27 @@ def _start(setup: Setup) -> tuple[BaseProcess, Connection]:
     return process, here
 
 
-def _serve(setup: Setup, pipe: Connection) -> None:
+def _serve(model: Path | str | None, method: Method, pipe: Connection) -> None:
     """What a process does until the other end of its pipe is closed."""
+    import cv2
+
+    from sq_perception.recovery.recoverer import Recoverer
+
+    cv2.setNumThreads(1)  # its threads spin while they wait, on the cores of the other processes
+    recoverer: Recoverer | None = None
     while True:
         try:
             work = pipe.recv()
         except EOFError:
             return
         try:
-            answer: FrameRecovery | Exception = _recover(setup, work)
+            recoverer = recoverer or Recoverer(model, method=method, threads=1)
+            answer: FrameRecovery | Exception = _pack(
+                recoverer.recover(work.depth, work.camera, work.labels, work.options)
+            )
         except Exception as error:  # the answer to this frame; who asked raises it
             answer = error
         pipe.send(answer)
-
-
-@cache
-def _recoverer(setup: Setup) -> Recoverer:
-    import cv2
-
-    from sq_perception.recovery.recoverer import Recoverer
-
-    cv2.setNumThreads(1)  # its threads spin while they wait, on the cores of the other processes
-    return Recoverer(setup.model, method=setup.options.method, threads=1)
-
-
-def _recover(setup: Setup, work: Work) -> FrameRecovery:
-    return _pack(_recoverer(setup).recover(work.depth, work.camera, work.labels, work.options))
 
 
 def _pack(found: FrameRecovery) -> FrameRecovery:

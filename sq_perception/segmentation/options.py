@@ -72,10 +72,6 @@ class SegmentationOptions:
         if not self.max_size > 0:
             raise ValueError(f"max_size: expected a positive number, got {self.max_size}")
 
-    def is_small(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
-        """Whether points (n, 3) are no larger than a thing."""
-        return largest_edge(points, up) <= self.max_size
-
     def is_within(self, points: np.ndarray) -> bool:
         """Whether the middle of points (n, 3) lies in the workspace."""
         if self.workspace is None:

@@ -131,7 +131,7 @@ def limited(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: Se
         rows, columns = regions.pixels(found.labels, label, extents[label])
         seen = valid[rows, columns]
         points = regions.some_points(rows[seen], columns[seen], depth, camera, POINTS)
-        if camera.is_pinhole and not options.is_small(points, up):
+        if camera.is_pinhole and largest_edge(points, up) > options.max_size:
             larger.add(label)
         elif not options.is_within(points):
             outside.add(label)

@@ -18,12 +18,11 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer
-from sq_perception.recovery.workers import Setup, Work
+from sq_perception.recovery.workers import Work
 
 pytestmark = pytest.mark.process
 _CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 _OPTIONS = RecoveryOptions(method="symmetry")
-_SETUP = Setup(None, _OPTIONS)
 
 
 def _frames(count: int) -> list[tuple[int, Work]]:
@@ -41,7 +40,8 @@ def _frames(count: int) -> list[tuple[int, Work]]:
 def test_two_processes_answer_as_one_and_in_order() -> None:
     frames = _frames(7)
     alone = Recoverer(method="symmetry", threads=1)
-    answers = list(workers.recover_all([*frames[:3], (-1, None), *frames[3:]], workers.Processes(_SETUP, 2)))
+    executor = workers.Processes(None, "symmetry", 2)
+    answers = list(workers.recover_all([*frames[:3], (-1, None), *frames[3:]], executor))
     assert [key for key, _ in answers] == [0, 1, 2, -1, 3, 4, 5, 6]
     assert answers[3][1] is None
     for (_, work), (_, answer) in zip(frames, [one for one in answers if one[1] is not None], strict=True):
@@ -56,7 +56,7 @@ def test_two_processes_answer_as_one_and_in_order() -> None:
 @pytest.mark.parametrize("seconds", [0.0, 0.1, 0.3])
 def test_a_ctrl_c_while_a_process_begins_is_not_for_it(seconds: float) -> None:
     """Its imports take longer than that; what they were interrupted in was printed."""
-    process, pipe = workers._start(_SETUP)
+    process, pipe = workers._start(None, "symmetry")
     time.sleep(seconds)
     os.kill(process.pid, signal.SIGINT)
     pipe.close()
@@ -67,14 +67,14 @@ def test_a_ctrl_c_while_a_process_begins_is_not_for_it(seconds: float) -> None:
 def test_what_a_frame_raises_is_its_answer() -> None:
     (_, work), *_ = _frames(1)
     wrong = Work(work.depth[:10], work.camera, None, work.options)
-    (_, error), (_, answer) = workers.recover_all([(0, wrong), (1, work)], workers.Processes(_SETUP, 2))
+    (_, error), (_, answer) = workers.recover_all([(0, wrong), (1, work)], workers.Processes(None, "symmetry", 2))
     assert isinstance(error, ValueError)
     assert len(answer.bodies) == 1
 
 
 def test_a_killed_process_costs_no_frame_and_answers_none_twice() -> None:
     frames, seen = _frames(24), []
-    for key, answer in workers.recover_all(frames, workers.Processes(_SETUP, 2)):
+    for key, answer in workers.recover_all(frames, workers.Processes(None, "symmetry", 2)):
         seen.append(key)
         assert len(answer.bodies) == 1
         if key == 5:
@@ -82,7 +82,7 @@ def test_a_killed_process_costs_no_frame_and_answers_none_twice() -> None:
     assert seen == list(range(24))
 
 
-def _dies_while_it_answers(_: Setup, pipe: Connection) -> None:
+def _dies_while_it_answers(model: None, method: str, pipe: Connection) -> None:
     pipe.recv()
     os.write(pipe.fileno(), (1000).to_bytes(4, "big") + b"the first bytes of a thousand")
     os._exit(1)
@@ -90,7 +90,7 @@ def _dies_while_it_answers(_: Setup, pipe: Connection) -> None:
 
 def test_processes_that_die_while_they_answer_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_serve", _dies_while_it_answers)
-    answers = list(workers.recover_all(_frames(2), workers.Processes(_SETUP, 2)))
+    answers = list(workers.recover_all(_frames(2), workers.Processes(None, "symmetry", 2)))
     assert [key for key, _ in answers] == [0, 1]
     assert all(isinstance(answer, workers.WorkerLostError) for _, answer in answers)
 
@@ -106,7 +106,7 @@ def test_a_frame_at_which_processes_die_takes_no_other_with_it(monkeypatch: pyte
                 os.kill(process, signal.SIGKILL)
 
     killer = threading.Thread(target=kill)
-    answers = workers.recover_all(frames, workers.Processes(_SETUP, 1))
+    answers = workers.recover_all(frames, workers.Processes(None, "symmetry", 1))
     found = [next(answers), next(answers)]
     killer.start()
     found.append(next(answers))
