@@ -14,6 +14,7 @@ from sq_perception.learning import inference
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.segmentation import segments
 from sq_perception.segmentation.options import SegmentationOptions
+from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 
 VGA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -42,12 +43,18 @@ class Table:
         depth, index = raycast.render(Superquadric.stack(bodies), camera)
         behind = plane_depth(self.plane, camera) if table else np.full(depth.shape, np.inf)
         seen = (index >= 0) & ~(behind < depth)
-        depth = np.where(seen, depth, behind)
-        depth = np.where(np.isfinite(depth), depth, np.nan)
-        return noisy(depth, noise, seed), np.where(seen, index + 1, 0).astype(np.int32)
+        return noisy(np.where(seen, depth, behind), noise, seed), np.where(seen, index + 1, 0).astype(np.int32)
+
+    def sensed(self, bodies, sensor, seed):
+        """Depth float32 by a sensor of :data:`sensor_noise.PRESETS`, and labels int32."""
+        depth, truth = self.see(bodies)
+        measured = sensor_noise.preset(sensor).measure(depth.astype(float), VGA, np.random.default_rng(seed))
+        return measured.astype(np.float32), truth
 
 
-def noisy(depth, noise, seed=0):
+def noisy(depth, noise=1e-3, seed=0):
+    """Depth float32, NaN for inf, with noise that grows as z^2."""
+    depth = np.where(np.isfinite(depth), depth, np.nan)
     rng = np.random.default_rng(seed)
     return (depth + noise * depth**2 * rng.standard_normal(depth.shape)).astype(np.float32)
 

@@ -10,8 +10,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import convex_parts
-from sq_perception.segmentation.segments import segment
-from sq_perception.simulation.scenes import table_scene
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -119,14 +117,6 @@ def test_nothing_to_say_changes_nothing(depth):
     np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE), labels)
     labels[50:100, 50:100] = 3
     np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE) > 0, labels > 0)
-
-
-def test_bodies_apart_keep_their_segments():
-    scene = table_scene(np.random.default_rng(3), 4)
-    depth, truth = scene.render()
-    found = segment(depth, scene.camera)
-    assert len(found.ids) == 4
-    assert min(ious(truth, found.labels)) > 0.95
 
 
 def behind_a_post(tilt=0.0, between=0.5):

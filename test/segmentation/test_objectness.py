@@ -11,15 +11,8 @@ from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.segmentation import objectness
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.segments import segment
-from sq_perception.simulation import sensor_noise
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-
-
-def sensed(table, bodies, sensor, seed):
-    depth, truth = table.see(bodies)
-    measured = sensor_noise.preset(sensor).measure(depth.astype(float), VGA, np.random.default_rng(seed))
-    return measured.astype(np.float32), truth
 
 
 @pytest.mark.parametrize("height", [0.004, 0.01])
@@ -69,7 +62,7 @@ def test_flat_cartons_of_unequal_thickness_are_found(sensor):
     places = ((-0.2, 0.15, 0.015), (-0.2, -0.12, 0.02), (0.14, -0.05, 0.025), (0.2, 0.2, 0.03))
     bodies = [table.body(x, y, (0.1, 0.075, high / 2), (0.06, 0.06), 0.3 * k) for k, (x, y, high) in enumerate(places)]
     for seed in range(2):
-        depth, truth = sensed(table, bodies, sensor, seed)
+        depth, truth = table.sensed(bodies, sensor, seed)
         assert min(ious(truth, judged_by_network(depth, VGA).labels)) > 0.8
 
 
@@ -77,7 +70,7 @@ def test_a_limit_that_no_object_exceeds_changes_nothing():
     """Boxes of 6 cm in a row, whose gaps a sensor closes: together they are longer than the limit."""
     table = Table(pitch=1.0, distance=0.8)
     bodies = [table.body(0.065 * k - 0.23, 0.03 * (k % 2), (0.03, 0.03, 0.02 + 0.006 * (k % 3))) for k in range(8)]
-    depth, truth = sensed(table, bodies, "realsense_d435", 0)
+    depth, truth = table.sensed(bodies, "realsense_d435", 0)
     wide, narrow = (judged_by_network(depth, VGA, max_size=limit) for limit in (0.6, 0.12))
     assert min(ious(truth, wide.labels)) > 0.5
     np.testing.assert_array_equal(wide.labels, narrow.labels)
@@ -88,7 +81,7 @@ def test_what_is_larger_than_a_thing_is_left_out_as_a_whole_and_said():
     table = Table(pitch=0.5, distance=2.2)
     column = table.body(0.1, 0.4, (0.2, 0.15, 0.5), (0.05, 0.05), 0.4)
     can = table.body(-0.3, -0.1, (0.05, 0.05, 0.08), (0.1, 1.0))
-    depth, truth = sensed(table, [column, can], "realsense_d435", 1)
+    depth, truth = table.sensed([column, can], "realsense_d435", 1)
     found = Recoverer(threads=1).recover(depth, VGA)
     assert best_iou(truth == 2, found.labels) > 0.7
     assert not found.labels[truth == 1].any()

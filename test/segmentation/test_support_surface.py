@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from table_scenes import VGA, Table, best_iou, ious, judged_by_network
+from table_scenes import VGA, Table, best_iou, ious, judged_by_network, noisy
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -36,13 +36,6 @@ def with_bodies(depth, bodies, camera=CAMERA):
     rendered, index = raycast.render(Superquadric.stack(bodies), camera)
     seen = (index >= 0) & (rendered < depth)
     return np.where(seen, rendered, depth), np.where(seen, index + 1, 0)
-
-
-def noisy(depth, sigma=1e-3, seed=0):
-    rng = np.random.default_rng(seed)
-    with np.errstate(invalid="ignore"):
-        depth = depth + sigma * depth**2 * rng.standard_normal(depth.shape)
-    return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
 
 
 def bulging(away, bulge, camera=CAMERA):
