@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sq_msgs_py import columns
-from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
+from sq_msgs_py.columns import Columns, column
 from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.poses import matrices, poses_at, product, unit_quaternions
 
@@ -28,10 +28,7 @@ if TYPE_CHECKING:
     from moveit_msgs.msg import Grasp
     from sensor_msgs.msg import PointCloud2
 
-FIELDS: tuple[tuple[str, int], ...] = (
-    *((name, FLOAT32) for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "opening", "width", "score")),
-    ("id", UINT32),
-)
+FIELDS = columns.described("x y z qx qy qz qw opening width score id", unsigned="id")
 """Name and PointField datatype of every field, in the order of the message."""
 
 
@@ -62,7 +59,7 @@ def from_message(message: PointCloud2) -> GraspArray:
 
     Raises MessageError as for superquadrics.
     """
-    return columns.from_message(GraspArray, message, [name for name, _ in FIELDS])
+    return columns.from_message(GraspArray, message)
 
 
 def poses(grasps: GraspArray, header: Any, types: MessageTypes = find_type) -> PoseArray:

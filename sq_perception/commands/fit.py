@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from sq_perception.commands.console import (
-    FAILURE,
     STANDARD_OUTPUT,
     SUCCESS,
+    USAGE,
     at_least,
     complain,
     parser,
     positive,
-    reject_usage,
     text_target,
     write_document,
 )
@@ -51,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     options = command.parse_args(arguments)
     if options.no_taper and options.most > 1:
-        return reject_usage("--no-taper: only with one body")
+        return complain("--no-taper: only with one body", USAGE)
     return _run(options)
 
 
@@ -60,14 +59,13 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.cloud_file import read_surface
 
     if options.json and Path(options.json).resolve() in {Path(name).resolve() for name in options.files}:
-        return reject_usage(f"--json: {options.json} is read as well")
+        return complain(f"--json: {options.json} is read as well", USAGE)
     code, entries = SUCCESS, []
     for name in options.files:
         try:
             entry = _fit(name, read_surface(Path(name)), options)
         except (UnpackingError, OSError, ValueError) as error:
-            complain(f"{name}: {error}")
-            code = FAILURE
+            code = complain(f"{name}: {error}")
             continue
         entries.append(entry)
         if options.json != STANDARD_OUTPUT:
