@@ -37,12 +37,12 @@ from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
 from sq_perception.nodes.managed_node import ManagedNode, optional
-from sq_perception.nodes.outputs import Outputs, pose_in
+from sq_perception.nodes.outputs import Outputs, in_frame, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.nodes.tracking import Pose as CameraPose
-from sq_perception.recordings.publication import Findings
+from sq_perception.recordings.publication import Findings, findings
 from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
 from sq_perception.tracking import association
@@ -84,7 +84,7 @@ class FrameNode(ManagedNode):
         self._statistics = Statistics()
         self._poses = CameraPoses(self)
         self._tracking = Tracking(self, self._poses)
-        self._outputs = Outputs(self, self._poses)
+        self._outputs = Outputs(self)
         self._input: Input | None = None
         self._worker: threading.Thread | None = None
         self._enabled = True
@@ -184,7 +184,7 @@ class FrameNode(ManagedNode):
             arrival: Arrival | None = None
             outcome: Outcome | None = None
             try:
-                with TURNS.turn():
+                with TURNS:
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
                     found = self._recover(source, arrival) if arrival is not None and self._is_wanted() else None
@@ -266,7 +266,8 @@ class FrameNode(ManagedNode):
         with timed(stages, "tracking"):
             found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
-            shown = self._outputs.make_findings(found, frame, parameters)
+            here = findings(found, frame.header, frame.is_cube)
+            shown = in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
             # Both may have waited for transforms.  Disabled meanwhile: least of all a grasped body is published.
             if not self._is_wanted():
                 return None

@@ -441,7 +441,7 @@ def test_lost_messages_are_counted_and_the_remedy_fits_the_subscription(make_ben
     if not asked:
         deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         bench.peer.create_publisher(Image, "depth/image", deaf)
-        bench.until(lambda: source._image.qos.reliability == QoSReliabilityPolicy.BEST_EFFORT)
+        bench.until(lambda: source._image._qos.reliability == QoSReliabilityPolicy.BEST_EFFORT)
     for listener, total, new in ((source._image, 3, 3), (source._image, 5, 2), (source._info, 1, 1)):
         listener._on_message_lost(SimpleNamespace(total_count=total, total_count_change=new))
     assert bench.counts.lost == {"/depth/image": 5, "/depth/camera_info": 1}
