@@ -27,6 +27,14 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 FRAME_ID = "some_camera_optical_frame"
 
+BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
+CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
+DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] + [0.02, 0.03, 0.04]))
+
+
+def recovered(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
+    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
+
 
 def ball(label: int = 1, status: Status = Status.CONVERGED, radius: float = 0.1) -> Recovery:
     body = Superquadric(np.full(3, radius), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))

@@ -110,32 +110,26 @@ class Call:
     milliseconds: float
 
 
-class Peer:
+class Peer(SpunNodes):
     """A node in this process, spun in the background, that publishes, listens and calls."""
 
     def __init__(self) -> None:
         os.environ.update(process.additions())
-        self._spun = SpunNodes()
-        self.node = self._spun.peer
+        super().__init__()
+        self.node = self.peer
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
         self._answers: dict[str, list[Answer]] = {}
         self._diagnoses: dict[str, list[Diagnosis]] = {}
-        self._spun.spin([])
+        self.spin([])
         self.listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
-
-    def __enter__(self) -> Peer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._spun.close()
 
     # Listening
 
     def listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None], depth: int = 50) -> None:
         """Subscribe; the callback runs in the background thread."""
         self.node.create_subscription(kind, topic, callback, depth)
-        self._spun.executor.wake()
+        self.executor.wake()
 
     def answers(self, node: str) -> list[Answer]:
         """The results of a node ("/recover_node"), growing from the first call on."""
@@ -183,7 +177,7 @@ class Peer:
         """Call a service; the future holds the response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-            self._spun.executor.wake()
+            self.executor.wake()
         until(self._clients[name].service_is_ready, alive)
         return self._clients[name].call_async(request)
 

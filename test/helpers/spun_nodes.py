@@ -13,6 +13,7 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 
 PATIENCE = 30.0
@@ -70,6 +71,12 @@ class SpunNodes:
         # An events executor keeps what it was waiting for until it is collected, and the next nodes would hear of it.
         del self.executor
         gc.collect()
+
+    @staticmethod
+    def set(node: Node, **values: Any) -> None:
+        """Set parameters of a node one by one, which it has to accept."""
+        for result in node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
+            assert result.successful, result.reason
 
     @staticmethod
     def until(condition: Callable[[], Any]) -> None:

@@ -13,7 +13,6 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from frame_node_bench import CAMERA, Bench
 from packed_depth import pack
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from spun_nodes import SpunNodes
 from stand_in_tf2 import Tf2
@@ -70,7 +69,7 @@ def test_units_marks_and_ranges_are_read_as_in_files(make_bench, monkeypatch):
     bench.send_info()
     bench.answer(bench.depth(value=500.0))
     np.testing.assert_allclose(bench.recoverer.asked[-1][0], 0.5)
-    bench.node.set_parameters([Parameter("depth_scale", value=0.0)])
+    bench.set(bench.node, depth_scale=0.0)
     infos: list[str] = []
     monkeypatch.setattr(bench.node.get_logger(), "info", lambda text, **_: infos.append(text))
     depth = np.full((48, 64), 0.5)
@@ -78,7 +77,7 @@ def test_units_marks_and_ranges_are_read_as_in_files(make_bench, monkeypatch):
     bench.answer(depth_to_message(depth, bench.header()))
     np.testing.assert_array_equal(np.isnan(bench.recoverer.asked[-1][0]), depth == 10)
     assert any("10 m is taken for no reading" in text for text in infos)
-    bench.node.set_parameters([Parameter("depth_kind", value="range")])
+    bench.set(bench.node, depth_kind="range")
     bench.answer(bench.depth(value=0.5))
     seen, camera, _, _ = bench.recoverer.asked[-1]
     np.testing.assert_allclose(np.linalg.norm(camera.points(seen), axis=2), 0.5, rtol=1e-6)
@@ -193,7 +192,7 @@ def test_a_cloud_that_is_no_image_has_pixels_of_no_mask(make_bench):
     row = cloud(points[None], bench.header())
 
     def decided(use: str) -> SimpleNamespace:
-        assert bench.node.set_parameters([Parameter("use_masks", value=use)])[0].successful
+        bench.set(bench.node, use_masks=use)
         row.header = bench.header()
         masks.publish(labels_to_message(np.ones((48, 64), np.int32), row.header))
         before = bench.counts
@@ -228,7 +227,7 @@ def test_labels_of_points_are_masks_and_points_of_another_frame_are_moved_by_tf(
         header.frame_id = frame_id
         return cloud(there, header, labels)
 
-    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
+    bench.set(bench.node, use_masks="always")
     clouds.publish(labelled("base"))
     bench.until(lambda: bench.answers)
     assert bench.answers[-1].header.frame_id == "camera_optical"
@@ -236,7 +235,7 @@ def test_labels_of_points_are_masks_and_points_of_another_frame_are_moved_by_tf(
     np.testing.assert_allclose(image, depth, rtol=1e-5)
     assert camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
     np.testing.assert_array_equal(masks, labels)
-    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
+    bench.set(bench.node, use_masks="never")
     clouds.publish(labelled("base"))
     bench.until(lambda: len(bench.answers) == 2)
     assert bench.recoverer.asked[-1][2] is None

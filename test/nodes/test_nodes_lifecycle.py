@@ -190,8 +190,8 @@ class TestLifecycle:
         bench = make_bench("-p", "autostart:=false")
         assert bench.state() == "unconfigured"
         assert not bench.made
-        assert bench.node.set_parameters([Parameter("projection", value="orthographic")])[0].successful
-        assert bench.node.set_parameters([Parameter("projection", value="pinhole")])[0].successful
+        bench.set(bench.node, projection="orthographic")
+        bench.set(bench.node, projection="pinhole")
         bench.report(lambda one: one.level == DiagnosticStatus.OK and one.message == "unconfigured")
         assert bench.change(Transition.TRANSITION_CONFIGURE)
         assert bench.state() == "inactive"
@@ -293,11 +293,11 @@ class TestLifecycle:
 class TestSwap:
     def test_the_next_frame_has_the_model_that_was_set_last(self, make_bench):
         bench = make_bench().active()
-        assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful
+        bench.set(bench.node, s=3)
         assert bench.answer() == 1.0
         assert len(bench.made) == 1, "what does not concern the recoverer swaps nothing"
         for model in ("2", "4", "3"):
-            assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
+            bench.set(bench.node, model=model)
         assert bench.answer() == 3.0
         assert bench.node._engine.description == "method auto, 3 on cpu"
         assert len(bench.made) == 2
@@ -308,12 +308,12 @@ class TestSwap:
         refused = bench.node.set_parameters([Parameter("model", value="bad")])[0]
         assert (refused.successful, refused.reason) == (False, "model: bad is no model")
         bench.fault = MemoryError("no room for weights")
-        assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        bench.set(bench.node, model="4")
         assert bench.answer() == 1.0
         reason = "cannot change to method auto, 4 on cpu: no room for weights"
         bench.report(lambda one: one.level == DiagnosticStatus.WARN and one.message == reason)
         bench.fault = None
-        assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        bench.set(bench.node, model="4")
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
 
@@ -322,7 +322,7 @@ class TestSwap:
         bench.gate.clear()
         bench.node.start()
         bench.until(lambda: bench.node.state == "configuring")
-        assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
+        bench.set(bench.node, model="6")
         bench.gate.set()
         assert bench.active().answer() == 6.0
 
@@ -337,7 +337,7 @@ class TestSeveralCameras:
                 assert bench.answer(space) == 1.0
         for space in ("front", "wrist"):
             assert {one.header.frame_id for one in bench.answers[space]} == {f"{space}_camera"}
-        assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
+        bench.set(bench.nodes[1], model="7")
         assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0), "a swap leaves the other alone"
 
     def test_one_frame_at_a_time_and_nobody_starves(self, make_bench):
@@ -372,8 +372,8 @@ class TestSeveralCameras:
         bench = make_bench(namespaces=("front", "wrist")).active()
         bench.answer("wrist")
         box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
-        assert bench.nodes[1].set_parameters([Parameter("target_frame", value="base")])[0].successful
-        assert bench.nodes[1].set_parameters([Parameter("workspace", value=box)])[0].successful
+        bench.set(bench.nodes[1], target_frame="base")
+        bench.set(bench.nodes[1], workspace=box)
         bench.publish("wrist")
         bench.until(waits.is_set)
         assert bench.answer("front") == 1.0
