@@ -68,10 +68,6 @@ def poses(grasps: GraspArray, header: Any, types: MessageTypes = find_type) -> P
     return types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
 
 
-APPROACH, LEAST_APPROACH = 0.1, 0.05
-"""Metres of a straight way to the grasp and away from it: what the planner keeps free, and what MoveIt has to find."""
-
-
 def moveit_grasps(
     grasps: GraspArray, header: Any, link: str, link_from_tcp: tuple[Sequence[float], Sequence[float]],
     up: Sequence[float] | None, prefix: str, joints: Sequence[str] = (), types: MessageTypes = find_type,
@@ -92,7 +88,8 @@ def moveit_grasps(
 
     def straight(frame: Any, way: Sequence[float]) -> Any:
         direction = stamped(header=frame, vector=vector(x=float(way[0]), y=float(way[1]), z=float(way[2])))
-        return translation(direction=direction, desired_distance=APPROACH, min_distance=LEAST_APPROACH)
+        # Metres: what the planner keeps free, and what MoveIt has to find.
+        return translation(direction=direction, desired_distance=0.1, min_distance=0.05)
 
     def posture(opening: float) -> Any:
         if not joints:

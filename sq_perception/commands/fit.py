@@ -20,7 +20,6 @@ from sq_perception.commands.console import (
     write_document,
 )
 
-FORMAT, VERSION = "sq_perception.points", 1
 HELP = """\
 Fit superquadrics to point clouds or meshes of single objects, seen from all sides or some.
 
@@ -73,7 +72,8 @@ def _run(options: argparse.Namespace) -> int:
             for number, body in enumerate(entry["superquadrics"]):
                 print(f"  {number} {_line(body)}")
     if options.json:
-        text = json.dumps({"format": FORMAT, "version": VERSION, "files": entries}, indent=1, allow_nan=False) + "\n"
+        document = {"format": "sq_perception.points", "version": 1, "files": entries}
+        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         if (entries or options.json == STANDARD_OUTPUT) and (
             problem := write_document("json", options.json, text, code == SUCCESS)
         ):

@@ -28,7 +28,6 @@ from sq_perception.recordings.result_json import plain_name
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer, Recovery
 
-FORMAT, VERSION = "sq_perception.grasps", 1
 _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score", "weakest")
 
 
@@ -53,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
         entries: list[dict[str, Any]] = []
         code, is_whole = _plan_all(recorded, Recoverer(), hand, friction, options, entries)
         chosen = {"gripper": hand.name, "friction": friction}
-        document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
+        document = {"format": "sq_perception.grasps", "version": 1, "options": chosen, "frames": entries}
         text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist) + "\n"
         is_printed = options.json == STANDARD_OUTPUT
         is_wanted = is_printed or (options.json and entries)

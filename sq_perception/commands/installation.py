@@ -89,7 +89,7 @@ _DOCTOR_HELP = """\
 Show what is installed, what is missing, and how to get it; the exit code is 1 where the
 core cannot work.
 """
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parent.parent
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "exr": ("OpenEXR",),
