@@ -138,16 +138,16 @@ class Bench(SpunNodes):
         self.infos.publish(message)
         self.until(lambda: len(self.node._input._infos) > before)
 
-    def send(self, message: Image) -> Any:
+    def send(self, message: Any, publisher: Any = None) -> Any:
         """Publish an image and wait for its verdict: the counts after it."""
         before = self.counts
-        self.images.publish(message)
+        (publisher or self.images).publish(message)
         self.until(lambda: self.counts.received > before.received and self.counts.in_work == 0)
         return self.counts
 
-    def answer(self, message: Image) -> tuple[PointCloud2, SuperquadricArray]:
+    def answer(self, message: Any, publisher: Any = None) -> tuple[PointCloud2, SuperquadricArray]:
         """Publish a good image; the published result."""
         before = len(self.answers)
-        self.send(message)
+        self.send(message, publisher)
         self.until(lambda: len(self.answers) > before)
         return self.answers[-1], from_message(self.answers[-1])

@@ -32,20 +32,16 @@ def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
     depth[:5] = np.nan
     for encoding in ("16UC1", "32FC1"):
         form, data = pack(depth, encoding)
-        header = bench.header()
-        packed.publish(CompressedImage(header=header, format=form, data=data))
-        bench.until(lambda header=header: any(one.header == header for one in bench.answers))
+        bench.answer(CompressedImage(header=bench.header(), format=form, data=data), packed)
         seen = bench.recoverer.asked[-1][0]
         assert np.isnan(seen[:5]).all()
         np.testing.assert_allclose(seen[5:], 0.731, atol=1e-3)
     hostile = [("", b""), ("16UC1; compressedDepth png", b""), (form, data[:40]), ("rgb8; jpeg", b"abc")]
     for number, (bad_form, bad_data) in enumerate(hostile, start=1):
-        packed.publish(CompressedImage(header=bench.header(), format=bad_form, data=bad_data))
-        bench.until(lambda number=number: bench.counts.refused == number)
-        assert bench.counts.last_error
-    header = bench.header()
-    packed.publish(CompressedImage(header=header, format=form, data=data))
-    bench.until(lambda: any(one.header == header for one in bench.answers))
+        counts = bench.send(CompressedImage(header=bench.header(), format=bad_form, data=bad_data), packed)
+        assert counts.refused == number
+        assert counts.last_error
+    bench.answer(CompressedImage(header=bench.header(), format=form, data=data), packed)
 
 
 @pytest.mark.parametrize(
@@ -155,8 +151,7 @@ def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make
     points[5, :9] = 0.0  # what some drivers send for nothing
 
     def answered(message: PointCloud2) -> tuple:
-        clouds.publish(message)
-        bench.until(lambda: any(one.header == message.header for one in bench.answers))
+        bench.answer(message, clouds)
         return bench.recoverer.asked[-1]
 
     seen, camera, labels, options = answered(cloud(points, bench.header()))
@@ -178,8 +173,7 @@ def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make
     nowhere.fields[3].offset = 30
     behind, nothing = cloud(-points, bench.header()), cloud(points[:0], bench.header())
     for number, hostile in enumerate((unnamed, short, nowhere, behind, nothing), start=1):
-        clouds.publish(hostile)
-        bench.until(lambda number=number: bench.counts.refused == number)
+        assert bench.send(hostile, clouds).refused == number
     answered(cloud(points, bench.header()))
 
 
@@ -195,10 +189,7 @@ def test_a_cloud_that_is_no_image_has_pixels_of_no_mask(make_bench):
         bench.set(bench.node, use_masks=use)
         row.header = bench.header()
         masks.publish(labels_to_message(np.ones((48, 64), np.int32), row.header))
-        before = bench.counts
-        clouds.publish(row)
-        bench.until(lambda: bench.counts.received > before.received and bench.counts.in_work == 0)
-        return bench.counts
+        return bench.send(row, clouds)
 
     counts = decided("auto")
     assert (counts.answered, counts.refused) == (1, 0), counts.last_error
@@ -228,17 +219,13 @@ def test_labels_of_points_are_masks_and_points_of_another_frame_are_moved_by_tf(
         return cloud(there, header, labels)
 
     bench.set(bench.node, use_masks="always")
-    clouds.publish(labelled("base"))
-    bench.until(lambda: bench.answers)
-    assert bench.answers[-1].header.frame_id == "camera_optical"
+    assert bench.answer(labelled("base"), clouds)[0].header.frame_id == "camera_optical"
     image, camera, masks, _ = bench.recoverer.asked[-1]
     np.testing.assert_allclose(image, depth, rtol=1e-5)
     assert camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
     np.testing.assert_array_equal(masks, labels)
     bench.set(bench.node, use_masks="never")
-    clouds.publish(labelled("base"))
-    bench.until(lambda: len(bench.answers) == 2)
+    bench.answer(labelled("base"), clouds)
     assert bench.recoverer.asked[-1][2] is None
-    clouds.publish(labelled("map"))
-    bench.until(lambda: bench.counts.refused)
-    assert "camera_frame: expected a transform from 'map' to 'camera_optical'" in bench.counts.last_error
+    expected = "camera_frame: expected a transform from 'map' to 'camera_optical'"
+    assert expected in bench.send(labelled("map"), clouds).last_error

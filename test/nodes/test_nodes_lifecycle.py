@@ -103,6 +103,12 @@ class Bench(SpunNodes):
         request = ChangeState.Request(transition=Transition(id=transition, label=label))
         return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
 
+    def led_up(self) -> Bench:
+        """Configured and activated, as by a manager."""
+        assert self.change(Transition.TRANSITION_CONFIGURE)
+        assert self.change(Transition.TRANSITION_ACTIVATE)
+        return self.active()
+
     def state(self) -> str:
         return str(self.call(GetState, "/recover_node/get_state").current_state.label)
 
@@ -179,9 +185,7 @@ class TestLifecycle:
         bench.made.clear()
         gc.collect()
         assert watched() is None, "the network is still in memory after the cleanup"
-        assert bench.change(Transition.TRANSITION_CONFIGURE)
-        assert bench.change(Transition.TRANSITION_ACTIVATE)
-        assert bench.active().answer() == 1.0
+        assert bench.led_up().answer() == 1.0
         assert len(bench.made) == 1
         assert bench.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert bench.state() == "finalized"
@@ -190,8 +194,8 @@ class TestLifecycle:
         bench = make_bench("-p", "autostart:=false")
         assert bench.state() == "unconfigured"
         assert not bench.made
-        bench.set(bench.node, projection="orthographic")
-        bench.set(bench.node, projection="pinhole")
+        for projection in ("orthographic", "pinhole"):
+            bench.set(bench.node, projection=projection)
         bench.report(lambda one: one.level == DiagnosticStatus.OK and one.message == "unconfigured")
         assert bench.change(Transition.TRANSITION_CONFIGURE)
         assert bench.state() == "inactive"
@@ -233,9 +237,7 @@ class TestLifecycle:
         reason = "cannot configure: weights.safetensors: no such model file"
         bench.report(lambda one: one.level == DiagnosticStatus.ERROR and one.message == f"unconfigured: {reason}")
         bench.fault = None
-        assert bench.change(Transition.TRANSITION_CONFIGURE)
-        assert bench.change(Transition.TRANSITION_ACTIVATE)
-        assert bench.active().answer() == 1.0
+        assert bench.led_up().answer() == 1.0
         bench.report(lambda one: one.level == DiagnosticStatus.OK)
 
     def test_an_autostart_that_fails_is_told_to_the_process(self, make_bench):
@@ -290,6 +292,7 @@ class TestLifecycle:
         assert bench.node.state == "finalized"
         assert withdrawn == ["deactivating"]
 
+
 class TestSwap:
     def test_the_next_frame_has_the_model_that_was_set_last(self, make_bench):
         bench = make_bench().active()
@@ -325,6 +328,7 @@ class TestSwap:
         bench.set(bench.node, model="6")
         bench.gate.set()
         assert bench.active().answer() == 6.0
+
 
 class TestSeveralCameras:
     @pytest.mark.parametrize("executor", [SingleThreadedExecutor, MultiThreadedExecutor, EventsExecutor])
@@ -372,8 +376,7 @@ class TestSeveralCameras:
         bench = make_bench(namespaces=("front", "wrist")).active()
         bench.answer("wrist")
         box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
-        bench.set(bench.nodes[1], target_frame="base")
-        bench.set(bench.nodes[1], workspace=box)
+        bench.set(bench.nodes[1], target_frame="base", workspace=box)
         bench.publish("wrist")
         bench.until(waits.is_set)
         assert bench.answer("front") == 1.0
@@ -394,6 +397,7 @@ class TestSeveralCameras:
             (found,) = bench.peer.get_publishers_info_by_topic(f"/{space}/recover_node/support_plane")
             kept[space] = found.qos_profile.durability.name
         assert kept == {"front": "VOLATILE", "wrist": "TRANSIENT_LOCAL"}
+
 
 def test_masks_that_come_later_than_newer_images_are_waited_for(make_bench):
     bench = make_bench("-p", "use_masks:=always", "-p", "patience:=5.0").active()
