@@ -56,8 +56,8 @@ def until(condition: Callable[[], Any], alive: Sequence[Child] = (), patience: f
     while not (result := condition()):
         for child in alive:
             assert child.exit_code is None, f"{child.name} ended:\n" + "\n".join(child.last_lines())
-        said = "\n".join(line for child in alive for line in child.last_lines())
-        assert time.monotonic() < deadline, f"waited {patience:g} s in vain\n{said}"
+        if time.monotonic() > deadline:
+            raise AssertionError("\n".join([f"waited {patience:g} s in vain", *(child.output() for child in alive)]))
         time.sleep(0.002)
     return result
 
@@ -261,15 +261,7 @@ def _absolute(topic: str) -> str:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process holds at one moment.
-
-    Attributes
-    ----------
-    rss
-        Resident memory, MB.
-    threads, files, segments
-        Counts; segments are the files of Fast DDS that it maps.
-    """
+    """What a process holds: resident memory, MB, and counts; segments are the files of Fast DDS that it maps."""
 
     rss: float
     threads: int
@@ -278,13 +270,7 @@ class Usage:
 
 
 def usage(pid: int) -> Usage:
-    """Read from /proc.
-
-    Raises
-    ------
-    OSError
-        If there is no such process.
-    """
+    """Read from /proc; OSError if there is no such process."""
     place = Path("/proc") / str(pid)
     lines = (line.split(":", 1) for line in (place / "status").read_text().splitlines())
     status = {key: value.split() for key, value in lines}

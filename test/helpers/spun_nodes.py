@@ -29,22 +29,12 @@ class SpunNodes:
 
     def spin(self, nodes: Sequence[Node], executor: Any = None) -> None:
         """Spin the nodes and the peer by an executor of that class."""
-        self._all: list[Node] = []
+        self._all = (*nodes, self.peer)
         self.executor = (executor or SingleThreadedExecutor)(context=self.context)
-        for node in (*nodes, self.peer):
-            self.add(node)
+        for node in self._all:
+            self.executor.add_node(node)
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.thread.start()
-
-    def add(self, node: Node) -> None:
-        """Spin one more."""
-        self._all.append(node)
-        self.executor.add_node(node)
-
-    def remove(self, node: Node) -> None:
-        """Spin that one no longer; it remains to be destroyed."""
-        self._all.remove(node)
-        self.executor.remove_node(node)
 
     def _spin(self) -> None:
         try:
