@@ -62,8 +62,12 @@ class Columns:
                 values = values.reshape(shape)
             if values.shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {values.shape}")
-            if is_unsigned:
-                _check_unsigned(name, values)
+            if is_unsigned and values.size:
+                if not np.issubdtype(values.dtype, np.integer):
+                    raise ValueError(f"{name}: expected integers, got {values.dtype}")
+                low, high, most = values.min(), values.max(), np.iinfo(np.uint32).max
+                if low < 0 or high > most:
+                    raise ValueError(f"{name}: expected 0 to {most}, got {low} to {high}")
             with np.errstate(over="ignore"):  # of a stranger's doubles: infinite
                 values = values.astype(np.uint32 if is_unsigned else np.float32)
             if each.metadata["is_finite"] and not np.isfinite(values).all():
@@ -156,13 +160,6 @@ def cloud_points(message: PointCloud2, known: Sequence[str], needed: Sequence[st
     layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
     rows = np.ndarray((height, width), layout, buffer=memoryview(message.data), strides=(row_step, step))
     return rows.reshape(-1)
-
-
-def _check_unsigned(name: str, values: np.ndarray) -> None:
-    if values.size and not np.issubdtype(values.dtype, np.integer):
-        raise ValueError(f"{name}: expected integers, got {values.dtype}")
-    if values.size and (values.min() < 0 or values.max() > np.iinfo(np.uint32).max):
-        raise ValueError(f"{name}: expected 0 to {np.iinfo(np.uint32).max}, got {values.min()} to {values.max()}")
 
 
 def points_from_message(message: PointCloud2) -> np.ndarray:

@@ -130,7 +130,8 @@ def findings() -> Iterator[tuple[str, str, bool]]:
         yield f"[{extra}]", remedy if missing else "there", False
     if distro := os.environ.get("ROS_DISTRO"):
         yield "ROS", f"{distro}, sourced", False
-    yield "weights", *_weights()
+    weights = ", ".join(sorted(path.stem for path in (_PACKAGE / "weights").glob("*.safetensors")))
+    yield "weights", weights or "missing: install the package again", not weights
     yield "kernels", *_kernels()
 
 
@@ -139,11 +140,6 @@ def _requirements() -> list[str]:
         return metadata.requires("sq-perception") or []
     except metadata.PackageNotFoundError:  # run from the sources
         return []
-
-
-def _weights() -> tuple[str, bool]:
-    found = sorted((_PACKAGE / "weights").glob("*.safetensors"))
-    return (", ".join(path.stem for path in found) or "missing: install the package again", not found)
 
 
 def _kernels() -> tuple[str, bool]:
