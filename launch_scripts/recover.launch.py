@@ -49,8 +49,6 @@ _YES = ("true", "1", "yes")
 _PARAMETERS = ("model", "target_frame")
 _SWITCHES = ("autostart", "use_sim_time")
 """Arguments that are parameters: one that is not given is left to ``params_file``, or to the node."""
-_RESPAWN_DELAY = 2.0
-"""Seconds: a model that is missing must not fill the log."""
 _MARKERS = ("recover_node/markers", "recover_node/rendered_depth", "fitter_node/markers", "grasp_node/markers")
 
 
@@ -126,7 +124,7 @@ def _node(
         executable=executable,
         output="screen",
         respawn=given["respawn"].lower() in _YES,
-        respawn_delay=_RESPAWN_DELAY,
+        respawn_delay=2.0,  # seconds: a model that is missing must not fill the log
         parameters=parameters,
         remappings=remappings,
         arguments=[*(arguments or []), *level],

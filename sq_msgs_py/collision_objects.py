@@ -7,10 +7,8 @@ usual collision checker, knows of a mesh only its surface.
 
 MoveIt takes objects on two topics, both with a queue of ten: ``collision_object``, one object a message, and
 ``planning_scene``, any number.  A frame is one difference (``is_diff``) for the latter: it arrives whole or not at all,
-and leaves alone what others put into the scene.
-
-MoveIt looks at the frame of the header, not at its stamp: it places an object by the newest transform that it has.  A
-camera that moves therefore wants its results in a frame that does not (``target_frame`` of the nodes).
+and leaves alone what others put into the scene.  MoveIt places an object by the newest transform of the header's frame,
+whatever its stamp.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Readers find fields by name, whatever their order, offset, type and byte order, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -21,8 +21,11 @@ if TYPE_CHECKING:
 _NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """By the datatypes of sensor_msgs/PointField."""
 UINT32, FLOAT32 = 6, 7
-Fields = Sequence[tuple[str, int]]
-"""Name and PointField datatype of every field, in the order of the message."""
+
+
+def described(names: str, unsigned: str) -> tuple[tuple[str, int], ...]:
+    """Return fields by their names; all are float32 but the unsigned ones, which are uint32."""
+    return tuple((name, UINT32 if name in unsigned.split() else FLOAT32) for name in names.split())
 
 
 class MessageError(ValueError):
@@ -39,12 +42,12 @@ def column(*names: str, is_finite: bool = False, missing: float = np.nan) -> Map
 class Columns:
     """n rows of numbers: the base of frozen dataclasses whose fields are columns (n,) or (n, k), by :func:`column`.
 
-    ``FIELDS`` are those of the message.  A column that is None is 0 or NaN.  Raises ValueError if a column has another
-    shape than the first one asks for, holds what is not finite and has to be, or one of its integers is no unsigned 32
-    bit integer.
+    ``FIELDS``: name and PointField datatype of every field, in the order of the message.  A column that is None is 0 or
+    NaN.  Raises ValueError if a column has another shape than the first one asks for, holds what is not finite and has
+    to be, or one of its integers is no unsigned 32 bit integer.
     """
 
-    FIELDS: ClassVar[Fields]
+    FIELDS: ClassVar[tuple[tuple[str, int], ...]]
 
     def __post_init__(self) -> None:
         kinds, count = dict(self.FIELDS), len(self)
@@ -59,8 +62,12 @@ class Columns:
                 values = values.reshape(shape)
             if values.shape != shape:
                 raise ValueError(f"{name}: expected shape {shape}, got {values.shape}")
-            if is_unsigned:
-                _check_unsigned(name, values)
+            if is_unsigned and values.size:
+                if not np.issubdtype(values.dtype, np.integer):
+                    raise ValueError(f"{name}: expected integers, got {values.dtype}")
+                low, high, most = values.min(), values.max(), np.iinfo(np.uint32).max
+                if low < 0 or high > most:
+                    raise ValueError(f"{name}: expected 0 to {most}, got {low} to {high}")
             with np.errstate(over="ignore"):  # of a stranger's doubles: infinite
                 values = values.astype(np.uint32 if is_unsigned else np.float32)
             if each.metadata["is_finite"] and not np.isfinite(values).all():
@@ -100,12 +107,14 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = find_type) -> P
     )
 
 
-def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) -> Rows:
-    """Return the rows of a message; columns whose fields are not all there, and not ``needed``, are left out.
+def from_message(kind: type[Rows], message: PointCloud2) -> Rows:
+    """Return the rows of a message; columns that have a default are left out where their fields are not all there.
 
     Raises MessageError as :func:`cloud_points`, or for columns that ``kind`` does not take.
     """
-    points = cloud_points(message, kind.FIELDS, needed)
+    needed = {name for each in fields(kind) if each.default is MISSING for name in each.metadata["names"]}
+    known = [name for name, _ in kind.FIELDS]
+    points = cloud_points(message, known, [name for name in known if name in needed])
     columns: dict[str, np.ndarray] = {}
     for each in fields(kind):
         names = each.metadata["names"]
@@ -118,8 +127,8 @@ def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) 
         raise MessageError(str(error)) from error
 
 
-def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str]) -> np.ndarray:
-    """Return the points (n,) of a cloud as a structured array of those of the described fields that are there.
+def cloud_points(message: PointCloud2, known: Sequence[str], needed: Sequence[str]) -> np.ndarray:
+    """Return the points (n,) of a cloud as a structured array of those of the known fields that are there.
 
     Raises MessageError if a field that is needed is missing, one has an unknown datatype, a count other than one or an
     offset outside the point, or if the data is not as long as width, height and steps require.
@@ -129,7 +138,7 @@ def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str])
     missing = [name for name in needed if name not in present]
     if missing:
         raise MessageError(f"expected the fields {' '.join(needed)}; missing: {' '.join(missing)}")
-    names = [name for name, _ in described if name in present]
+    names = [name for name in known if name in present]
     formats = []
     for name in names:
         field = present[name]
@@ -153,16 +162,9 @@ def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str])
     return rows.reshape(-1)
 
 
-def _check_unsigned(name: str, values: np.ndarray) -> None:
-    if values.size and not np.issubdtype(values.dtype, np.integer):
-        raise ValueError(f"{name}: expected integers, got {values.dtype}")
-    if values.size and (values.min() < 0 or values.max() > np.iinfo(np.uint32).max):
-        raise ValueError(f"{name}: expected 0 to {np.iinfo(np.uint32).max}, got {values.min()} to {values.max()}")
-
-
 def points_from_message(message: PointCloud2) -> np.ndarray:
     """Return points, float32 (height, width, 3), as they stand in a message: NaN or (0, 0, 0) for none, metres."""
-    found = cloud_points(message, [(name, FLOAT32) for name in "xyz"], "xyz")
+    found = cloud_points(message, "xyz", "xyz")
     with np.errstate(over="ignore"):  # doubles that no camera measures: infinite
         points = np.stack([found[name].astype(np.float32) for name in "xyz"], axis=-1)
     return points.reshape(int(message.height), int(message.width), 3)
@@ -174,5 +176,4 @@ def labels_of_points(message: PointCloud2, fields: Sequence[str]) -> np.ndarray 
     name = next((name for name in fields if name in present), None)
     if name is None:
         return None
-    found = cloud_points(message, [(name, UINT32)], [name])[name]
-    return found.reshape(int(message.height), int(message.width))
+    return cloud_points(message, [name], [name])[name].reshape(int(message.height), int(message.width))

@@ -4,8 +4,7 @@ Depth follows REP 118: 16UC1 holds millimetres with 0 for "no reading", 32FC1 ho
 the numbers as they stand (:mod:`sq_perception.imaging.depth_units` makes metres of them), in place, through their row
 stride (``step``) and byte order (``is_bigendian``).
 
-What reads a message only looks at its fields, so that messages of rosbags, which come without a ROS installation, are
-read by the same code.  What makes one takes its class from ``types``, by default that of the ROS installation.
+Readers look at fields alone, so that they read messages of rosbags without a ROS installation too.
 
 Reference: REP 118, Depth Images, https://www.ros.org/reps/rep-0118.html
 """

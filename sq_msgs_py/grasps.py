@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sq_msgs_py import columns
-from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
+from sq_msgs_py.columns import Columns, column
 from sq_msgs_py.message_types import MessageTypes, find_type
 from sq_msgs_py.poses import matrices, poses_at, product, unit_quaternions
 
@@ -28,10 +28,7 @@ if TYPE_CHECKING:
     from moveit_msgs.msg import Grasp
     from sensor_msgs.msg import PointCloud2
 
-FIELDS: tuple[tuple[str, int], ...] = (
-    *((name, FLOAT32) for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "opening", "width", "score")),
-    ("id", UINT32),
-)
+FIELDS = columns.described("x y z qx qy qz qw opening width score id", unsigned="id")
 """Name and PointField datatype of every field, in the order of the message."""
 
 
@@ -62,17 +59,13 @@ def from_message(message: PointCloud2) -> GraspArray:
 
     Raises MessageError as for superquadrics.
     """
-    return columns.from_message(GraspArray, message, [name for name, _ in FIELDS])
+    return columns.from_message(GraspArray, message)
 
 
 def poses(grasps: GraspArray, header: Any, types: MessageTypes = find_type) -> PoseArray:
     """Return the poses alone as a geometry_msgs/PoseArray, in the same order."""
     found = poses_at(grasps.position, grasps.rotation, types)
     return types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
-
-
-APPROACH, LEAST_APPROACH = 0.1, 0.05
-"""Metres of a straight way to the grasp and away from it: what the planner keeps free, and what MoveIt has to find."""
 
 
 def moveit_grasps(
@@ -95,7 +88,8 @@ def moveit_grasps(
 
     def straight(frame: Any, way: Sequence[float]) -> Any:
         direction = stamped(header=frame, vector=vector(x=float(way[0]), y=float(way[1]), z=float(way[2])))
-        return translation(direction=direction, desired_distance=APPROACH, min_distance=LEAST_APPROACH)
+        # Metres: what the planner keeps free, and what MoveIt has to find.
+        return translation(direction=direction, desired_distance=0.1, min_distance=0.05)
 
     def posture(opening: float) -> Any:
         if not joints:

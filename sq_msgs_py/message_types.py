@@ -1,11 +1,7 @@
-"""Where the classes of messages come from.
+"""Where the classes of messages come from: a ROS installation, or a library that writes recordings without one.
 
-What makes a message asks for its class by the full name ``package/msg/Name`` and gives every field by keyword; fields
-left out take ROS's defaults.  Any classes with the names and fields of ROS will do: those of an installation, which is
-the default, or those of a library that writes recordings without one.  Both then hold the same numbers, as the same
-code computed them.
-
-Sequences of numbers are given as lists or array.array, whatever the class at hand would rather have.
+A class is asked for by its full name ``package/msg/Name`` and gets its fields by keyword, sequences of numbers as lists
+or array.array; fields left out take ROS's defaults.
 """
 
 from __future__ import annotations

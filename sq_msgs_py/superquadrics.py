@@ -50,7 +50,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sq_msgs_py import columns
-from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
+from sq_msgs_py.columns import Columns, column
 from sq_msgs_py.columns import MessageError as MessageError
 from sq_msgs_py.message_types import MessageTypes, find_type
 
@@ -75,19 +75,12 @@ class Reason(IntFlag):
     """The camera sees into an open vessel: it can be taken by its rim."""
 
 
-FIELDS: tuple[tuple[str, int], ...] = tuple(
-    (name, FLOAT32)
-    for name in (
-        *("x", "y", "z", "qx", "qy", "qz", "qw", "a1", "a2", "a3", "e1", "e2"),
-        *("score", "residual", "sigma_a1", "sigma_a2", "sigma_a3"),
-    )
-) + tuple((name, UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
-FIELDS += tuple((f"sigma_{name}", FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
-FIELDS += (("kx", FLOAT32), ("ky", FLOAT32), ("objectness", FLOAT32), ("part", UINT32))
+FIELDS = columns.described(
+    "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status label seen fused reason "
+    "sigma_e1 sigma_e2 sigma_c1 sigma_c2 sigma_c3 sigma_r1 sigma_r2 sigma_r3 kx ky objectness part",
+    unsigned="id status label seen fused reason part",
+)
 """Name and PointField datatype of every field, in the order of the message."""
-
-_NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index("label")])
-"""Fields that every cloud has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,4 +161,4 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
     Raises MessageError if a field is missing, has an unknown datatype, a count other than one or an offset outside the
     point, or if the data is not as long as width, height and steps require.
     """
-    return columns.from_message(SuperquadricArray, message, _NEEDED)
+    return columns.from_message(SuperquadricArray, message)

@@ -8,8 +8,9 @@ import math
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 from sq_perception.files import output_file
 
@@ -18,14 +19,16 @@ if TYPE_CHECKING:
 
     from sq_perception.recordings.cloud_file import CloudFrame
 
+_Value = TypeVar("_Value")
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
 _NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(,[-+.\de]*)*|-inf(inity)?", re.IGNORECASE)
 
 
-def complain(message: str) -> None:
-    """Print one line to standard error, without control characters from recordings."""
+def complain(message: str, code: int = FAILURE) -> int:
+    """Print one line to standard error, without control characters from recordings; return the exit code."""
     print(f"sq-perception: {printable(' '.join(message.split()))}", file=sys.stderr)
+    return code
 
 
 class _Complaints(logging.Handler):
@@ -45,18 +48,6 @@ def show_log() -> None:
 def printable(text: str) -> str:
     """Replace characters that cannot be printed, such as file name bytes that are no UTF-8, by question marks."""
     return "".join(c if c.isprintable() else "?" for c in text)
-
-
-def fail(message: str) -> int:
-    """Complain of a failure; return its exit code."""
-    complain(message)
-    return FAILURE
-
-
-def reject_usage(message: str) -> int:
-    """Complain of wrong usage; return its exit code."""
-    complain(message)
-    return USAGE
 
 
 class Parser(argparse.ArgumentParser):
@@ -82,67 +73,64 @@ def with_negatives(arguments: Sequence[str]) -> list[str]:
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 
-def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Return the argument type of a whole number from ``least`` to ``most``, or without an upper bound."""
+def argument(convert: Callable[[str], _Value]) -> Callable[[str], _Value]:
+    """Return the argument type of a conversion whose ValueError or OSError says what is wrong."""
 
-    def check(text: str) -> int:
+    def check(text: str) -> _Value:
         try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
-        if value < least:
-            raise argparse.ArgumentTypeError(f"expected at least {least}, got {value}")
-        if most is not None and value > most:
-            raise argparse.ArgumentTypeError(f"expected {least} to {most}, got {value}")
-        return value
+            return convert(text)
+        except (ValueError, OSError) as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
 
     return check
 
 
-def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float]:
+def number(
+    wanted: str, holds: Callable[[Any], bool], kind: Callable[[str], Any] = float
+) -> Callable[[str], Any]:
     """Return the argument type of a number for which ``holds`` is true; ``wanted`` names it in complaints."""
 
-    def check(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not holds(value):
-            raise argparse.ArgumentTypeError(f"expected {wanted}, got {text}")
-        return value
+    def check(text: str) -> Any:
+        with suppress(ValueError):
+            if holds(value := kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"expected {wanted}, got {text}")
 
     return check
+
+
+def at_least(least: int, most: float = math.inf) -> Callable[[str], int]:
+    """Return the argument type of a whole number from ``least`` to ``most``."""
+    wanted = f"a whole number of at least {least}" if most == math.inf else f"a whole number from {least} to {most}"
+    return number(wanted, lambda value: least <= value <= most, int)
 
 
 positive = number("a positive number", lambda value: 0 < value < math.inf)
 
 
+@argument
 def target(text: str) -> Path:
     """Check an output file name, which is tried; an argument type."""
     if not Path(text).resolve().parent.is_dir():
-        raise argparse.ArgumentTypeError(f"{text}: its folder does not exist")
-    try:
-        output_file.check(text)
-    except OSError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+        raise ValueError(f"{text}: its folder does not exist")
+    output_file.check(text)
     return Path(text)
 
 
+@argument
 def text_target(text: str) -> str:
     """Check an output file name, or - for standard output; an argument type."""
     if text not in (STANDARD_OUTPUT, "/dev/stdout"):
         return str(target(text))
     if sys.stdout is None:
-        raise argparse.ArgumentTypeError("the standard output is closed")
+        raise ValueError("the standard output is closed")
     return STANDARD_OUTPUT
 
 
+@argument
 def folder(text: str) -> Path:
     """Make and check a folder for results; an argument type."""
-    try:
-        output_file.check_folder(text)
-    except OSError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    output_file.check_folder(text)
     return Path(text)
 
 
@@ -193,13 +181,11 @@ def add_depth(command: argparse.ArgumentParser) -> None:
     command.add_argument("--ignore-masks", action="store_true", help="segment frames even if they have labels")
 
 
+@argument
 def _cloud_frame(text: str) -> CloudFrame:
     from sq_perception.recordings.cloud_file import CloudFrame
 
-    try:
-        return CloudFrame.parse(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
+    return CloudFrame.parse(text)
 
 
 def progress() -> Progress:

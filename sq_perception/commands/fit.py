@@ -9,19 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from sq_perception.commands.console import (
-    FAILURE,
     STANDARD_OUTPUT,
     SUCCESS,
+    USAGE,
     at_least,
     complain,
     parser,
     positive,
-    reject_usage,
     text_target,
     write_document,
 )
 
-FORMAT, VERSION = "sq_perception.points", 1
 HELP = """\
 Fit superquadrics to point clouds or meshes of single objects, seen from all sides or some.
 
@@ -51,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     options = command.parse_args(arguments)
     if options.no_taper and options.most > 1:
-        return reject_usage("--no-taper: only with one body")
+        return complain("--no-taper: only with one body", USAGE)
     return _run(options)
 
 
@@ -60,14 +58,13 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.cloud_file import read_surface
 
     if options.json and Path(options.json).resolve() in {Path(name).resolve() for name in options.files}:
-        return reject_usage(f"--json: {options.json} is read as well")
+        return complain(f"--json: {options.json} is read as well", USAGE)
     code, entries = SUCCESS, []
     for name in options.files:
         try:
             entry = _fit(name, read_surface(Path(name)), options)
         except (UnpackingError, OSError, ValueError) as error:
-            complain(f"{name}: {error}")
-            code = FAILURE
+            code = complain(f"{name}: {error}")
             continue
         entries.append(entry)
         if options.json != STANDARD_OUTPUT:
@@ -75,7 +72,8 @@ def _run(options: argparse.Namespace) -> int:
             for number, body in enumerate(entry["superquadrics"]):
                 print(f"  {number} {_line(body)}")
     if options.json:
-        text = json.dumps({"format": FORMAT, "version": VERSION, "files": entries}, indent=1, allow_nan=False) + "\n"
+        document = {"format": "sq_perception.points", "version": 1, "files": entries}
+        text = json.dumps(document, indent=1, allow_nan=False) + "\n"
         if (entries or options.json == STANDARD_OUTPUT) and (
             problem := write_document("json", options.json, text, code == SUCCESS)
         ):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sq_perception.commands import console
-from sq_perception.commands.console import STANDARD_OUTPUT, complain, fail, reject_usage
+from sq_perception.commands.console import STANDARD_OUTPUT, USAGE, complain
 from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import kernel_cache, mesh
@@ -28,7 +28,6 @@ from sq_perception.recordings.result_json import plain_name
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer, Recovery
 
-FORMAT, VERSION = "sq_perception.grasps", 1
 _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score", "weakest")
 
 
@@ -38,7 +37,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         hand = gripper(options.gripper)
     except ValueError as error:
-        return reject_usage(str(error))
+        return complain(str(error), USAGE)
     friction = options.friction or planner.FRICTION
     try:
         reading = Reading(
@@ -49,11 +48,11 @@ def run(options: argparse.Namespace) -> int:
         )
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
-            return reject_usage(problem)
+            return complain(problem, USAGE)
         entries: list[dict[str, Any]] = []
         code, is_whole = _plan_all(recorded, Recoverer(), hand, friction, options, entries)
         chosen = {"gripper": hand.name, "friction": friction}
-        document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
+        document = {"format": "sq_perception.grasps", "version": 1, "options": chosen, "frames": entries}
         text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist) + "\n"
         is_printed = options.json == STANDARD_OUTPUT
         is_wanted = is_printed or (options.json and entries)
@@ -63,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
             _print_table(entries)
         return code
     except (FrameError, CheckpointError, OSError) as error:
-        return fail(str(error))
+        return complain(str(error))
 
 
 def _plan_all(
@@ -76,10 +75,10 @@ def _plan_all(
     try:
         for file, frame in recorded:
             if isinstance(frame, FrameError):
-                code = fail(str(frame))
+                code = complain(str(frame))
                 continue
             if frame.is_cube:
-                code = fail(f"{file}: a view of the unit cube has no metres to grasp in")
+                code = complain(f"{file}: a view of the unit cube has no metres to grasp in")
                 continue
             for text in filter(None, (frame.warning, frame.notes)):
                 complain(f"{file}: {text}")
@@ -87,15 +86,14 @@ def _plan_all(
             try:
                 bodies = _bodies(stem, frame, recoverer, hand, friction, options)
             except (ValueError, ArithmeticError) as error:  # such as a camera of no image
-                code = fail(f"{file}: {frame.name}: {error}")
+                code = complain(f"{file}: {frame.name}: {error}")
                 continue
             stamp = None if frame.stamp is None else frame.stamp._asdict()
             entries.append({"file": plain_name(file), "stamp": stamp, "bodies": bodies})
     except KeyboardInterrupt:
-        complain("interrupted; what is done so far is kept")
-        return console.INTERRUPTED, False
+        return complain("interrupted; what is done so far is kept", console.INTERRUPTED), False
     except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
-        return fail(str(error)), False
+        return complain(str(error)), False
     return code, True
 
 

@@ -89,7 +89,7 @@ _DOCTOR_HELP = """\
 Show what is installed, what is missing, and how to get it; the exit code is 1 where the
 core cannot work.
 """
-_PACKAGE = Path(__file__).parents[1]
+_PACKAGE = Path(__file__).parent.parent
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "exr": ("OpenEXR",),
@@ -130,7 +130,8 @@ def findings() -> Iterator[tuple[str, str, bool]]:
         yield f"[{extra}]", remedy if missing else "there", False
     if distro := os.environ.get("ROS_DISTRO"):
         yield "ROS", f"{distro}, sourced", False
-    yield "weights", *_weights()
+    weights = ", ".join(sorted(path.stem for path in (_PACKAGE / "weights").glob("*.safetensors")))
+    yield "weights", weights or "missing: install the package again", not weights
     yield "kernels", *_kernels()
 
 
@@ -139,11 +140,6 @@ def _requirements() -> list[str]:
         return metadata.requires("sq-perception") or []
     except metadata.PackageNotFoundError:  # run from the sources
         return []
-
-
-def _weights() -> tuple[str, bool]:
-    found = sorted((_PACKAGE / "weights").glob("*.safetensors"))
-    return (", ".join(path.stem for path in found) or "missing: install the package again", not found)
 
 
 def _kernels() -> tuple[str, bool]:

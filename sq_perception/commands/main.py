@@ -78,18 +78,15 @@ def _run(given: list[str]) -> int:
             return stop.code
         return SUCCESS if stop.code is None else USAGE
     except KeyboardInterrupt:
-        complain("interrupted")
-        return INTERRUPTED
+        return complain("interrupted", INTERRUPTED)
     except ModuleNotFoundError as error:
         if error.name is None or error.name.partition(".")[0] != "torch":
             raise
-        complain(f"{given[0]} {NEEDS_TORCH}")
-        return FAILURE
+        return complain(f"{given[0]} {NEEDS_TORCH}")
     except BrokenPipeError:
         return FAILURE
     except OSError as error:
-        complain(f"{given[0]}: {error}")
-        return FAILURE
+        return complain(f"{given[0]}: {error}")
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -6,13 +6,13 @@ Outputs are checked before the first frame is read, and existing files are kept 
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from sq_perception.commands.console import (
     add_depth,
+    argument,
     at_least,
     folder,
     number,
@@ -212,15 +212,17 @@ def grasp(arguments: Sequence[str]) -> int:
     return grasp_run.run(options)
 
 
+@argument
 def _region(text: str) -> tuple[int, int, int, int]:
     try:
         left, top, width, height = (int(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"expected left,top,width,height in pixels, got {text!r}") from None
+        raise ValueError(f"expected left,top,width,height in pixels, got {text!r}") from None
     return left, top, width, height
 
 
+@argument
 def _existing(text: str) -> Path:
     if not Path(text).is_dir():
-        raise argparse.ArgumentTypeError(f"{text}: expected a folder")
+        raise ValueError(f"{text}: expected a folder")
     return Path(text)

@@ -20,7 +20,7 @@ from dataclasses import replace
 from typing import Any
 
 from sq_perception.commands import console
-from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, fail, reject_usage
+from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, USAGE, complain
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import CUT_SHORT, Status
 from sq_perception.geometry import kernel_cache
@@ -97,23 +97,22 @@ def _details(body: Mapping[str, Any]) -> str:
 def run(options: argparse.Namespace) -> int:
     """Run ``sq-perception recover`` with these options; return the exit code."""
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
-        return reject_usage("--json, --jsonl, --csv: only one of them can be the standard output")
+        return complain("--json, --jsonl, --csv: only one of them can be the standard output", USAGE)
     if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
-        return reject_usage("--poses: expected a pinhole camera, and a method with deviations: auto or symmetry")
+        return complain("--poses: expected a pinhole camera, and a method with deviations: auto or symmetry", USAGE)
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
     kernel_cache.compile_beside()
     try:
         this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
-        return fail(str(error))
+        return complain(str(error))
     except ValueError as error:
-        return reject_usage(str(error))
+        return complain(str(error), USAGE)
     code = this.over_all_frames()
     this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
-        complain(problem)
-        code = code or FAILURE
+        code = complain(problem, code or FAILURE)
     if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
         for line in (*lines(this.outputs.results, options.verbose), *scene_lines(this.outputs.scene)):
             print(line)
@@ -174,11 +173,9 @@ class RecoverRun:
                     complain(str(error))
                     self._unreadable += 1
                 except OSError as error:  # of a file that is written: the disk is full, and will be for the next frame
-                    complain(str(error))
-                    return FAILURE
+                    return complain(str(error))
         except KeyboardInterrupt:
-            complain("interrupted; what is done so far is kept")
-            return console.INTERRUPTED
+            return complain("interrupted; what is done so far is kept", console.INTERRUPTED)
         finally:
             for text, files in self._said.items():
                 if len(files) > 1:

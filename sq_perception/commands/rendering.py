@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands.console import (
     SUCCESS,
+    USAGE,
     at_least,
     complain,
-    fail,
     parser,
-    reject_usage,
     target,
     with_negatives,
 )
@@ -43,7 +42,7 @@ def sample(arguments: Sequence[str]) -> int:
     command.add_argument("output", type=target, metavar="FILE", help="an .npz")
     output = command.parse_args(arguments).output
     if output.suffix.lower() != ".npz":
-        return reject_usage(f"{output}: expected a name that ends in .npz")
+        return complain(f"{output}: expected a name that ends in .npz", USAGE)
 
     import numpy as np
 
@@ -102,12 +101,12 @@ def _render(options: argparse.Namespace) -> int:
     pinhole = options.projection == "pinhole"
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
-        return reject_usage(f"--output: {output.name}: an image of this projection is a {kinds}")
+        return complain(f"--output: {output.name}: an image of this projection is a {kinds}", USAGE)
     beside = output.with_suffix(".yaml")
     if pinhole and suffix == ".png" and beside.exists() and not output.exists():
-        return fail(f"{beside}: the camera of {output.name} goes there, but something else has that name")
+        return complain(f"{beside}: the camera of {output.name} goes there, but something else has that name")
     if not pinhole and options.focal is not None:
-        return reject_usage("--focal: of a pinhole camera; see --projection")
+        return complain("--focal: of a pinhole camera; see --projection", USAGE)
 
     import numpy as np
 
@@ -118,17 +117,17 @@ def _render(options: argparse.Namespace) -> int:
     try:
         given = np.array([getattr(options, name) for name in PARAMETERS])
         if not np.isfinite(given).all():
-            return reject_usage(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
+            return complain(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}", USAGE)
         body = Superquadric.from_flat(given)
         seen = body if pinhole else unit_cube.optical_from_cube(body)
         camera = _camera(options)
     except ValueError as error:
-        return reject_usage(str(error))
+        return complain(str(error), USAGE)
     width, height = camera.width, camera.height
     longest = 10**6  # that OpenCV and libpng write and read
     if width * height > MOST_PIXELS or max(width, height) > longest:  # nor would any command read it
         expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {longest}"
-        return reject_usage(f"{expected}, got {width} x {height}")
+        return complain(f"{expected}, got {width} x {height}", USAGE)
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
         complain("the camera does not see the body: the image is empty")

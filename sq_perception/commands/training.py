@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, fields, replace
 from functools import partial
@@ -19,7 +18,6 @@ from sq_perception.commands.console import (
     SUCCESS,
     at_least,
     complain,
-    fail,
     folder,
     parser,
     positive,
@@ -69,20 +67,26 @@ def train(arguments: Sequence[str]) -> int:
         command.error(str(error))
 
     from sq_perception.learning import train as training
-    from sq_perception.learning.checkpoint import CheckpointError
+
+    with progress() as bar:
+        task = bar.add_task("training", total=config.steps)
+
+        def advance(step: int, loss: float) -> None:
+            bar.update(task, completed=step, description=f"loss {loss:.4f}")
+
+        return _end_of("train", lambda: training.train(config, output, advance=advance))
+
+
+def _end_of(name: str, work: Callable[[], object]) -> int:
+    """Train or draw; return the exit code."""
+    from sq_perception.learning.training import Stopped
 
     try:
-        with progress() as bar:
-            task = bar.add_task("training", total=config.steps)
-            training.train(
-                config, output,
-                advance=lambda step, loss: bar.update(task, completed=step, description=f"loss {loss:.4f}"),
-            )
-    except training.Stopped as stopped:
-        print(stopped, file=sys.stderr)
-        return INTERRUPTED
-    except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
-        return fail(f"train: {error}")
+        work()
+    except Stopped as stopped:
+        return complain(f"{name}: {stopped}", INTERRUPTED)
+    except (ValueError, ArithmeticError, OSError) as error:
+        return complain(f"{name}: {error}")
     return SUCCESS
 
 
@@ -114,8 +118,7 @@ def thing_views(arguments: Sequence[str]) -> int:
     from sq_perception.simulation.thing_views import draw_thing_views
 
     def drawing() -> Callable[[Any], Any]:
-        own = read_things(given.meshes) if given.meshes is not None else ()
-        return partial(draw_thing_views, given.views, own=own)
+        return partial(draw_thing_views, given.views, own=read_things(given.meshes) if given.meshes else ())
 
     return _draw("thing-views", given, drawing)
 
@@ -131,33 +134,6 @@ def segment_views(arguments: Sequence[str]) -> int:
     from sq_perception.simulation.segment_views import draw_segment_views
 
     return _draw("segment-views", given, lambda: partial(draw_segment_views, given.scenes))
-
-
-def train_things(arguments: Sequence[str]) -> int:
-    """Run ``sq-perception train-things``; return the exit code."""
-    text = _TRAIN.format(
-        what="predicts the unseen side of objects", views="views that `thing-views` wrote",
-        weights="things.safetensors, which `recover --model` takes",
-    )
-    example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"
-    options = vars(_make_training_parser("things", text, example, THING_RUN).parse_args(arguments))
-
-    from sq_perception.learning.shard_training import THINGS
-
-    return _train(THINGS, THING_RUN, options)
-
-
-def train_masks(arguments: Sequence[str]) -> int:
-    """Run ``sq-perception train-masks``; return the exit code."""
-    text = _TRAIN.format(
-        what="finds outliers in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
-    )
-    example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
-    options = vars(_make_training_parser("masks", text, example, MASK_RUN).parse_args(arguments))
-
-    from sq_perception.learning.shard_training import MASKS
-
-    return _train(MASKS, MASK_RUN, options)
 
 
 def _make_drawing_parser(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
@@ -176,16 +152,32 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
     from sq_perception.geometry.threads import one_kernel_thread
     from sq_perception.learning.shard_training import write_views
 
-    try:
-        with one_kernel_thread():  # a process a core draws
-            write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
-    except ValueError as error:
-        return fail(f"{name}: {error}")
-    return SUCCESS
+    shards = range(given.first, given.first + given.shards)
+    with one_kernel_thread():  # a process a core draws
+        return _end_of(name, lambda: write_views(given.folder, shards, drawing(), given.seed))
 
 
-def _make_training_parser(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
-    """Make the common parser of both commands that train."""
+def train_things(arguments: Sequence[str]) -> int:
+    """Run ``sq-perception train-things``; return the exit code."""
+    text = _TRAIN.format(
+        what="predicts the unseen side of objects", views="views that `thing-views` wrote",
+        weights="things.safetensors, which `recover --model` takes",
+    )
+    example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"
+    return _train("things", THING_RUN, text, example, arguments)
+
+
+def train_masks(arguments: Sequence[str]) -> int:
+    """Run ``sq-perception train-masks``; return the exit code."""
+    text = _TRAIN.format(
+        what="finds outliers in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
+    )
+    example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
+    return _train("masks", MASK_RUN, text, example, arguments)
+
+
+def _train(subject: str, run: ShardTraining, text: str, example: str, arguments: Sequence[str]) -> int:
+    """Run one of both commands that train on shards."""
     command = parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
     add = command.add_argument
@@ -201,23 +193,12 @@ def _make_training_parser(subject: str, text: str, example: str, run: ShardTrain
     add("--seed", type=at_least(0), help="default %(default)s")
     add("--start", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
     add("--bfloat16", action="store_true", help="bfloat16 arithmetic, twice as fast on processors that have it")
-    return command
+    options = vars(command.parse_args(arguments))
 
-
-def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
     from sq_perception.learning import shard_training
-    from sq_perception.learning.checkpoint import CheckpointError
-    from sq_perception.learning.training import Stopped
 
-    views, output = options.pop("views"), options.pop("output")
-    try:
-        shard_training.train(subject, replace(run, **options), views, output)
-    except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
-        return fail(f"train-{subject.name}: {error}")
-    except Stopped as stopped:
-        complain(f"train-{subject.name}: {stopped}")
-        return INTERRUPTED
-    return SUCCESS
+    views, output, kind = options.pop("views"), options.pop("output"), getattr(shard_training, subject.upper())
+    return _end_of(f"train-{subject}", lambda: shard_training.train(kind, replace(run, **options), views, output))
 
 
 _EVALUATE_HELP = """\
@@ -274,7 +255,7 @@ def _run_evaluation(options: argparse.Namespace, methods: list[Method], command:
     for failure in failures:
         complain(failure)
     if not contestants:
-        return fail("nothing is left to evaluate")
+        return complain("nothing is left to evaluate")
     images = ThesisImages(max(count for _, count in contestants), options.seed)
     with progress() as bar:
         tasks = {contestant.name: bar.add_task(contestant.name, total=count) for contestant, count in contestants}

@@ -15,6 +15,7 @@ The plateau is the thesis' (chapter 5.3); its epoch is what lies between two val
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -70,7 +71,7 @@ class Plateau:
 
 
 @dataclass(frozen=True)
-class Run:
+class Run(ABC):
     """What the training of any network is made of; defaults are those of the compact regressor."""
 
     start: str = _setting("", "A model file whose weights the network begins with; empty begins at random.")
@@ -96,9 +97,9 @@ class Run:
     )
     device: str = _setting("cpu", "cpu or cuda.")
 
+    @abstractmethod
     def progress(self, step: int, seconds: float, plateau: Plateau) -> float:
-        """The share of the run that is done, by its steps, its seconds and its validations."""
-        raise NotImplementedError
+        """Return the share of the run that is done, by its steps, its seconds and its validations."""
 
     def rate(self, step: int, progress: float, plateau: Plateau) -> float:
         """The learning rate of a step; see the module."""

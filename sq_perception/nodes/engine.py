@@ -21,7 +21,6 @@ from typing import TypeAlias
 from rclpy.node import Node
 
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
@@ -30,8 +29,8 @@ from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.recovery.still_scene import Reference, StillScene
 from sq_perception.segmentation.options import Pose
+from sq_perception.simulation.scenes import TABLE_CAMERA
 
-WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _MADE_OF = ("device", "threads", "method", "model")
 """Parameters that determine a recoverer."""
 
@@ -40,40 +39,33 @@ Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 
 
 class Turns:
-    """Lock that is granted in the order of requests, so that no camera starves."""
+    """Lock that a ``with`` block holds, granted in the order of requests, so that no camera starves."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._waiting: deque[object] = deque()
 
-    @contextmanager
-    def turn(self) -> Iterator[None]:
-        """Wait for the caller's turn, and hold it within the block."""
-        self._take()
-        try:
-            yield
-        finally:
-            self._give()
-
-    @contextmanager
-    def pause(self) -> Iterator[None]:
-        """Give up the caller's turn within the block, and wait for another one at its end."""
-        self._give()
-        try:
-            yield
-        finally:
-            self._take()
-
-    def _take(self) -> None:
+    def take(self) -> None:
         ticket = object()
         with self._changed:
             self._waiting.append(ticket)
             self._changed.wait_for(lambda: self._waiting[0] is ticket)
 
-    def _give(self) -> None:
+    def give(self, *_: object) -> None:
         with self._changed:
             self._waiting.popleft()
             self._changed.notify_all()
+
+    __enter__, __exit__ = take, give
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Give up the caller's turn within the block, and wait for another one at its end."""
+        self.give()
+        try:
+            yield
+        finally:
+            self.take()
 
 
 TURNS = Turns()
@@ -85,9 +77,8 @@ _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDic
 class _Built:
     recoverer: Recoverer
     parameters: RecoverParameters
-    weights: Hashable
-    key: Hashable
-    """Equal for recoverers that nodes may share."""
+    key: tuple[Hashable, ...]
+    """Equal for recoverers that nodes may share; begins with the weights."""
 
 
 class Engine:
@@ -106,7 +97,7 @@ class Engine:
     def build(self, parameters: RecoverParameters) -> None:
         """Make and warm up the recoverer.  Raises ValueError if the model or the device cannot be used."""
         self.release()
-        with TURNS.turn():
+        with TURNS:
             self._built = _make(parameters)
 
     def release(self) -> None:
@@ -147,7 +138,7 @@ class Engine:
         if built is None:
             raise RuntimeError("the recoverer has been released")
         method = built.parameters.method  # another one may be set that cannot be had
-        origin = built.weights, method
+        origin = built.key[0], method
         key = frame.header.frame_id, origin
         last = self._last.get(key) if parameters.tracking else None
         options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
@@ -173,18 +164,18 @@ class Engine:
 
 def _make(parameters: RecoverParameters) -> _Built:
     """Return a warm recoverer, an existing one if it is equivalent."""
-    weights = _file(parameters.model)
     # Without the model: the same file may have several names.
-    key = (weights, *(getattr(parameters, name) for name in _MADE_OF if name != "model"))
+    key = (_file(parameters.model), *(getattr(parameters, name) for name in _MADE_OF if name != "model"))
     recoverer = _shared.get(key)
     if recoverer is None:
         recoverer = Recoverer(
             parameters.model or None, parameters.device, parameters.method, parameters.threads or None
         )
         still_scene.warm_up()
-        recoverer.warm_up(unit_cube.camera() if parameters.projection == "orthographic" else WARM_UP_CAMERA)
+        is_cube = parameters.projection == "orthographic"
+        recoverer.warm_up(unit_cube.camera() if is_cube else TABLE_CAMERA)
         _shared[key] = recoverer
-    return _Built(recoverer, parameters, weights, key)
+    return _Built(recoverer, parameters, key)
 
 
 def _file(model: str) -> Hashable:

@@ -22,10 +22,9 @@ from time import monotonic, perf_counter
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -36,13 +35,13 @@ from sq_perception.nodes import process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
-from sq_perception.nodes.managed_node import ManagedNode, optional
-from sq_perception.nodes.outputs import Outputs, pose_in
+from sq_perception.nodes.managed_node import STEADY, ManagedNode, optional
+from sq_perception.nodes.outputs import Outputs, in_frame, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.nodes.tracking import Pose as CameraPose
-from sq_perception.recordings.publication import Findings
+from sq_perception.recordings.publication import Findings, findings
 from sq_perception.recovery.recovery import timed
 from sq_perception.segmentation.options import Pose
 from sq_perception.tracking import association
@@ -50,8 +49,6 @@ from sq_perception.tracking import association
 TRIGGER_TIMEOUT = 5.0
 """Seconds without a frame after which ~/trigger and ~/recover fail, beyond those that an image waits for its
 camera_info: five periods of the slowest camera in use."""
-_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""Clock of timers: simulated time may stand still, which the node must still report."""
 
 
 class Outcome(NamedTuple):
@@ -75,16 +72,15 @@ class FrameNode(ManagedNode):
         self, name: str, kind: type[RecoverParameters] = RecoverParameters, *, namespace: str | None = None,
         context: Any = None, defaults: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
-        super().__init__(name, namespace=namespace, context=context)
+        super().__init__(name, Statistics(), namespace=namespace, context=context)
         self._engine = Engine(self)
         self._settings: LiveParameters[RecoverParameters] = LiveParameters(
             self, kind, locked=self._why_locked, check=self._engine.check, changed=self._engine.follow,
             defaults=defaults,
         )
-        self._statistics = Statistics()
         self._poses = CameraPoses(self)
         self._tracking = Tracking(self, self._poses)
-        self._outputs = Outputs(self, self._poses)
+        self._outputs = Outputs(self)
         self._input: Input | None = None
         self._worker: threading.Thread | None = None
         self._enabled = True
@@ -93,7 +89,6 @@ class FrameNode(ManagedNode):
         self._defects = 0
         self._triggers: dict[Future, float] = {}
         """Outcomes that callers of ~/trigger and ~/recover wait for, and the start of the wait."""
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Their answers wait for a frame; in the default group nothing else would run meanwhile.
         apart = ReentrantCallbackGroup()
@@ -104,7 +99,6 @@ class FrameNode(ManagedNode):
             callback_group=apart,
         )
         self._action = optional(self, self._serve_images, "sq_msgs/action/Recover", apart)
-        self.create_timer(1.0, self._on_second, clock=_STEADY)
         self.start(self._settings.current.autostart)
 
     # The lifecycle
@@ -184,7 +178,7 @@ class FrameNode(ManagedNode):
             arrival: Arrival | None = None
             outcome: Outcome | None = None
             try:
-                with TURNS.turn():
+                with TURNS:
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
                     found = self._recover(source, arrival) if arrival is not None and self._is_wanted() else None
@@ -266,7 +260,8 @@ class FrameNode(ManagedNode):
         with timed(stages, "tracking"):
             found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
-            shown = self._outputs.make_findings(found, frame, parameters)
+            here = findings(found, frame.header, frame.is_cube)
+            shown = in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
             # Both may have waited for transforms.  Disabled meanwhile: least of all a grasped body is published.
             if not self._is_wanted():
                 return None
@@ -357,7 +352,7 @@ class FrameNode(ManagedNode):
         # In a group of its own: rclpy's remember for good what was destroyed.
         alone = ReentrantCallbackGroup()
         waited = TRIGGER_TIMEOUT + self._settings.current.patience
-        late = self.create_timer(waited, caller.cancel, callback_group=alone, clock=_STEADY)
+        late = self.create_timer(waited, caller.cancel, callback_group=alone, clock=STEADY)
         outcome: Outcome | None = await caller
         self.destroy_timer(late)
         del self._triggers[caller]
@@ -374,7 +369,7 @@ class FrameNode(ManagedNode):
             if silent:
                 text = f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}"
                 self.get_logger().warning(text, throttle_duration_sec=THROTTLE)
-        more = {"state": self.state, "enabled": str(self._enabled).lower(), "engine": self._engine.description}
+        more = {"enabled": str(self._enabled).lower(), "engine": self._engine.description}
         if absent := self._outputs.optional.absent:
             more["missing packages"] = " ".join(absent.values())
         if self.is_active and parameters.tracking:
@@ -386,4 +381,4 @@ class FrameNode(ManagedNode):
             standing = DiagnosticStatus.OK, "disabled"
         elif standing is None and silent:
             standing = DiagnosticStatus.WARN, "no depth images arrive"
-        self._diagnostics.publish(self._statistics.report(self, standing, more))
+        self.report(standing, more)

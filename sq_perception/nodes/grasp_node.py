@@ -21,9 +21,8 @@ from time import monotonic
 from typing import Any, cast
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
-from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -94,9 +93,8 @@ class GraspNode(ManagedNode):
     """Node that plans grasps; see the module."""
 
     def __init__(self, name: str, *, context: Any = None) -> None:
-        super().__init__(name, context=context)
+        super().__init__(name, Statistics(what="cloud"), context=context)
         self._settings = LiveParameters(self, GraspParameters)
-        self._statistics = Statistics(what="cloud")
         self._last: PointCloud2 | None = None
         self._heard_at = monotonic()
         self._arrival = 0.0
@@ -109,12 +107,10 @@ class GraspNode(ManagedNode):
         """Held while publishing, or while publishing ends."""
         self._clouds: Listener | None = None
         self._planes: Any = None
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(Trigger, "~/plan", self._on_plan)
         optional(self, self.create_service, "sq_msgs/srv/PlanGrasps", "~/plan_array", self._on_plan_array)
         with suppress(ImportError):
             self.create_service(find_type("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
-        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self.start(self._settings.current.autostart)
 
     def _configure(self) -> None:
@@ -179,16 +175,15 @@ class GraspNode(ManagedNode):
 
     def _on_second(self) -> None:
         clouds, limit, silence = self._clouds, self._settings.current.no_cloud_warning, monotonic() - self._heard_at
-        more, standing = {"state": self.state}, self.standing()
-        if (cloud := self._last) is not None:
-            more["age of the bodies [s]"] = f"{self._age(cloud):.1f}"
+        cloud, standing = self._last, self.standing()
+        more = {} if cloud is None else {"age of the bodies [s]": f"{self._age(cloud):.1f}"}
         if clouds is not None:
             clouds.follow()
             if 0 < limit < silence:
                 text = f"no superquadrics on {clouds.topic} for {silence:.0f} s: {clouds.publishers}"
                 self.get_logger().warning(text, throttle_duration_sec=THROTTLE)
                 standing = standing or (DiagnosticStatus.WARN, "no superquadrics arrive")
-        self._diagnostics.publish(self._statistics.report(self, standing, more))
+        self.report(standing, more)
 
     def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         cloud = self._last

@@ -16,7 +16,7 @@ from typing import Any
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSProfile, QoSReliabilityPolicy, qos_check_compatible
+from rclpy.qos import QoSCompatibility, QoSPolicyKind, QoSReliabilityPolicy, qos_check_compatible
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
@@ -50,11 +50,6 @@ class Listener:
         """Guards the subscription: it is replaced in the executor's thread and closed in another one."""
         self._subscription: Subscription | None = None
         self._subscribe(self._choose_reliability())
-
-    @property
-    def qos(self) -> QoSProfile:
-        """The quality of service of the current subscription."""
-        return self._qos
 
     @property
     def publishers(self) -> str:
@@ -91,7 +86,7 @@ class Listener:
         return self._asked or (best_effort if best_effort in offered else QoSReliabilityPolicy.RELIABLE)
 
     def _subscribe(self, reliability: QoSReliabilityPolicy) -> None:
-        self._qos = newest()
+        self._qos = newest()  # rclpy writes the overrides into it
         self._qos.reliability = reliability
         events = SubscriptionEventCallbacks(
             matched=lambda _: self.follow(), incompatible_qos=lambda _: self._on_incompatible(),
@@ -99,11 +94,7 @@ class Listener:
         )
         overridable = QoSOverridingOptions(policy_kinds=(QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH))
         self._subscription = self._node.create_subscription(
-            self._kind,
-            self.topic,
-            self._callback,
-            self._qos,  # rclpy writes the overrides into it
-            event_callbacks=events,
+            self._kind, self.topic, self._callback, self._qos, event_callbacks=events,
             qos_overriding_options=overridable,
         )
 

@@ -24,18 +24,20 @@ from __future__ import annotations
 import queue
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.task import Future
 
 from sq_msgs_py.message_types import find_type
+from sq_perception.nodes.statistics import Standing, Statistics
 
 _NAMES = {
     Transition.TRANSITION_CONFIGURE: "configure",
@@ -46,6 +48,8 @@ _NAMES = {
     Transition.TRANSITION_INACTIVE_SHUTDOWN: "shutdown",
     Transition.TRANSITION_ACTIVE_SHUTDOWN: "shutdown",
 }
+STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""Clock of timers: simulated time may stand still, which nodes must still report."""
 _EXPECTED = (ValueError, OSError, RuntimeError)
 """Errors of a wrong file, parameter or device; any other is a program error and logged with its traceback."""
 _PAUSE = 2.0
@@ -66,9 +70,11 @@ def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any,
 
 
 class ManagedNode(LifecycleNodeMixin, Node):
-    """Lifecycle node that can start itself; see the module."""
+    """Lifecycle node that can start itself; see the module.  Its ``statistics`` count what it answers."""
 
-    def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
+    def __init__(
+        self, name: str, statistics: Statistics, *, namespace: str | None = None, context: Any = None
+    ) -> None:
         Node.__init__(self, name, namespace=namespace, context=context)
         # Not LifecycleNode, whose services share the default group: none would answer while a transition is awaited.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
@@ -85,6 +91,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run_tasks, name="transitions", daemon=True)
         self._thread.start()
+        self._statistics = statistics
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_timer(1.0, self._on_second, clock=STEADY)
 
     @property
     def state(self) -> str:
@@ -116,7 +125,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._starts_itself = True
         self._tasks.put(self._bring_up)
 
-    def standing(self, fault: str = "") -> tuple[bytes, str] | None:
+    def report(self, standing: Standing | None, more: Mapping[str, str]) -> None:
+        """Publish diagnostics: ``standing`` or that of the statistics, and ``more`` facts beside those."""
+        status = self._statistics.status(self.get_fully_qualified_name(), standing, {"state": self.state, **more})
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(message)
+
+    def standing(self, fault: str = "") -> Standing | None:
         """Return level and message for diagnostics of a node that is inactive or has a fault; None otherwise."""
         fault = self.fault or fault
         if self.is_active:
@@ -144,6 +160,9 @@ class ManagedNode(LifecycleNodeMixin, Node):
         self._state_machine.destroy_when_not_in_use()
 
     # What a subclass does
+
+    def _on_second(self) -> None:
+        """Look after the inputs and :meth:`report`; called each second, in the executor's thread."""
 
     def _configure(self) -> None:
         """Prepare what takes time or memory."""

@@ -41,7 +41,7 @@ from sq_perception.nodes.managed_node import optional
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
-from sq_perception.recordings.publication import Findings, Identified, findings
+from sq_perception.recordings.publication import Findings, Identified
 from sq_perception.recovery.recoverer import render_recovery
 from sq_perception.recovery.recovery import timed
 
@@ -51,10 +51,10 @@ ARRIVAL = Duration(seconds=0.5)
 
 
 class Outputs:
-    """The publishers of frames; used by one thread at a time.  ``poses`` give the camera's pose in ``target_frame``."""
+    """The publishers of frames; used by one thread at a time."""
 
-    def __init__(self, node: Node, poses: CameraPoses) -> None:
-        self._node, self._poses = node, poses
+    def __init__(self, node: Node) -> None:
+        self._node = node
         self.optional = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
         self._header: Any = None
@@ -89,14 +89,6 @@ class Outputs:
         if self._header is not None and self._node.context.ok():
             header, self._header = self._header, None
             self.markers.publish(markers([], [], header))
-
-    def make_findings(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
-        """Return the findings as every output shows them: in ``target_frame`` if there is one.
-
-        Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
-        """
-        here = findings(found, frame.header, frame.is_cube)
-        return in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
 
     def answer(self, shown: Findings) -> None:
         """Publish plane and point cloud."""
@@ -144,8 +136,10 @@ def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float, par
 
 
 def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
-    """Return findings in another tf2 frame; unchanged for an empty ``frame_id``.  Raises ValueError as
-    :func:`pose_in`."""
+    """Return findings in another tf2 frame; unchanged for an empty ``frame_id``.
+
+    Raises ValueError as :func:`pose_in`: nothing may be published in a wrong frame.
+    """
     return found.move(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 

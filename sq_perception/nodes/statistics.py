@@ -13,8 +13,7 @@ from datetime import datetime, timezone
 from time import monotonic
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.node import Node
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 THROTTLE = 5.0
 """Seconds between two log messages of the same place."""
@@ -74,12 +73,6 @@ class Statistics:
         with self._lock:
             self._stages.append((self._clock(), milliseconds))
         self.count("answered")
-
-    def report(self, node: Node, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticArray:
-        """Return the message of :meth:`status` for a node."""
-        message = DiagnosticArray(status=[self.status(node.get_fully_qualified_name(), standing, more)])
-        message.header.stamp = node.get_clock().now().to_msg()
-        return message
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
         """Return the diagnostics of a node, with ``more`` facts beside the frames.

@@ -1,16 +1,9 @@
 """synthetic_depth_node: depth images with known truth, or recorded ones, as a camera would publish them.
 
-| name | type | |
-| --- | --- | --- |
-| `depth/image` | sensor_msgs/Image | out: 32FC1 or 16UC1; mono8 or mono16 for orthographic frames |
-| `depth/camera_info` | sensor_msgs/CameraInfo | out: for pinhole frames |
-| `mask/image` | sensor_msgs/Image | out: label images (16UC1), where recordings have them or they are asked for |
-| `~/truth` | sensor_msgs/PointCloud2 | out: the bodies of generated scenes, in the message of the recovery |
-
-All have the same stamp and frame.  Publishers are reliable, so best effort subscribers receive them too.  The image is
-published last: whoever has it has the rest.
-
-:class:`FrameSource` holds each image for some frames, in which only the noise changes, and goes on to the next.
+Publishes depth/image (32FC1 or 16UC1, for orthographic frames mono8 or mono16), depth/camera_info of pinhole frames,
+mask/image where recordings have labels or they are asked for, and in ~/truth the bodies of generated scenes, in the
+message of the recovery.  All have the same stamp and frame, and the image comes last: whoever has it has the rest.
+Publishers are reliable, so best effort subscribers receive them too.
 """
 
 from __future__ import annotations

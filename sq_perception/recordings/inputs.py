@@ -207,7 +207,7 @@ def sequence_of(file: str, frame: RecordedFrame) -> tuple[str, str]:
 class RecordedTracks:
     """Follows the bodies of one sequence after the other; ``warn`` is called once where stamps are missing."""
 
-    def __init__(self, warn: Callable[[str], None], poses: CameraPoses | None = None) -> None:
+    def __init__(self, warn: Callable[[str], object], poses: CameraPoses | None = None) -> None:
         self._warn, self._poses = warn, poses
         self._session = TrackingSession()
         self._sequence: tuple[str, str] | None = None

@@ -15,60 +15,21 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from recover_runs import BODIES, CAMERA, camera_yaml, recover, run, save_npz, save_png
 from table_scenes import VGA, Table
 
-from sq_perception.commands import main, recover_outputs
+from sq_perception.commands import main
 from sq_perception.commands.console import complain
 from sq_perception.commands.recover_run import lines
 from sq_perception.fitting.fit import CUT_SHORT
-from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import COLOURS
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
-from sq_perception.learning import checkpoint
-from sq_perception.recordings import html_page
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
 from sq_perception.recovery.recoverer import Recoverer
-
-CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
-BODIES = Superquadric(
-    [[0.05, 0.04, 0.08], [0.03, 0.03, 0.05]], [[0.2, 0.9], [0.5, 1.0]], [[-0.08, 0.01, 0.7], [0.1, 0.0, 0.6]],
-    [[0.4, 0.2, 0.1, 0.8], [0.7, 0.1, 0.3, 0.6]],
-)
-
-
-def save_npz(path, depth=None, bodies=BODIES):
-    rendered, index = raycast.render(bodies, CAMERA)
-    depth = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32) if depth is None else depth
-    np.savez(path, depth=depth, K=CAMERA.matrix, labels=index + 1)
-    return path
-
-
-def save_png(path, millimetres=1000):
-    cv2.imwrite(str(path), np.full((120, 160), millimetres, np.uint16))
-    return path
-
-
-def camera_yaml(path, focal=200.0, distortion=0.0):
-    k = [focal, 0, 79.5, 0, focal, 59.5, 0, 0, 1]
-    p = [focal, 0, 79.5, 0, 0, focal, 59.5, 0, 0, 0, 1, 0]
-    info = {"image_width": 160, "image_height": 120, "camera_matrix": {"data": k}, "projection_matrix": {"data": p}}
-    path.write_text(yaml.safe_dump({**info, "distortion_coefficients": {"data": [distortion, 0, 0, 0, 0]}}))
-    return path
-
-
-def recover(tmp_path, *arguments, code=0):
-    out = tmp_path / "out.json"
-    assert run(*arguments, "--json", out) == code
-    return json.loads(out.read_text())["frames"]
-
-
-def run(*arguments):
-    return main.main(["recover", *map(str, arguments), "--method", "symmetry"])
 
 
 @pytest.fixture
@@ -122,7 +83,6 @@ def test_a_rendered_image_is_recovered_with_the_camera_beside_it_unless_the_fold
 
 def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch):
     for name in ("a", "b", "c"):
-        (tmp_path / name).mkdir()
         save_npz(tmp_path / name / "f.npz")
     listed = Path.iterdir
 
@@ -138,19 +98,15 @@ def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch
 
 
 def test_folders_are_looked_into_to_a_depth_that_is_said(tmp_path, caplog):
-    near, far = tmp_path / "1/2/3/4", tmp_path / "a/b/c/d/e"
-    for folder in (near, far):
-        folder.mkdir(parents=True)
-        save_npz(folder / "f.npz")
+    near, _ = save_npz(tmp_path / "1/2/3/4/f.npz"), save_npz(tmp_path / "a/b/c/d/e/f.npz")
     with caplog.at_level("WARNING"):
         found = RecordedInput([str(tmp_path)])
-    assert [file for file, _ in found] == [str(near / "f.npz")]
+    assert [file for file, _ in found] == [str(near)]
     assert "for 4 levels, and not farther down" in caplog.text
 
 
 def test_a_folder_of_depth_images_stands_for_its_siblings(tmp_path):
     for folder in ("depth", "mask", "rgb"):
-        (tmp_path / folder).mkdir()
         save_npz(tmp_path / folder / "f.npz")
     assert [file for file, _ in RecordedInput([str(tmp_path)])] == [str(tmp_path / "depth" / "f.npz")]
 
@@ -245,11 +201,8 @@ def test_counts_and_budgets_are_positive_and_a_score_is_from_0_to_1(tmp_path, op
 
 @pytest.mark.parametrize("kind", ["glb", "ply"])
 def test_meshes_are_the_bodies(tmp_path, kind):
-    save_npz(tmp_path / "a.npz")
-    save_npz(tmp_path / "empty.npz", np.full((120, 160), np.nan, np.float32))
-    frames = recover(
-        tmp_path, tmp_path / "a.npz", tmp_path / "empty.npz", "--meshes", tmp_path / "new", "--mesh-format", kind
-    )
+    names = save_npz(tmp_path / "a.npz"), save_npz(tmp_path / "empty.npz", np.full((120, 160), np.nan, np.float32))
+    frames = recover(tmp_path, *names, "--meshes", tmp_path / "new", "--mesh-format", kind)
     assert [path.name for path in (tmp_path / "new").iterdir()] == [f"a.{kind}"]
     path = tmp_path / "new" / f"a.{kind}"
     entries = frames[0]["superquadrics"]
@@ -270,9 +223,7 @@ def test_meshes_are_the_bodies(tmp_path, kind):
 
 
 def test_obstacles_are_the_bodies_and_larger_where_they_are_less_known(tmp_path, capsys):
-    save_npz(tmp_path / "a.npz")
-    save_npz(tmp_path / "empty.npz", np.full((120, 160), np.nan, np.float32))
-    names = tmp_path / "a.npz", tmp_path / "empty.npz"
+    names = save_npz(tmp_path / "a.npz"), save_npz(tmp_path / "empty.npz", np.full((120, 160), np.nan, np.float32))
     volumes = {}
     for inflate in ("0", "2"):
         folder = tmp_path / inflate
@@ -381,46 +332,12 @@ def test_csv_and_a_page_are_written_beside_each_other(tmp_path, capsys):
     assert "frames.push" in page.read_text()
 
 
-@pytest.mark.parametrize(
-    ("how", "code", "words"),
-    [(KeyboardInterrupt(), 130, "interrupted"), (OSError(28, "No space left on device"), 1, "No space left")],
-    ids=["Ctrl-C", "full disk"],
-)
-def test_an_interruption_leaves_whole_files(tmp_path, monkeypatch, capsys, how, code, words):
-    """While the second frame's mesh is being written: the first frame's files are there, and nothing half."""
-    names = [save_npz(tmp_path / f"{name}.npz") for name in ("a", "b", "c")]
-    export = mesh.export
-
-    def interrupted(bodies, path, **options):
-        export(bodies, path, **options)
-        if path.name.startswith("b."):
-            raise how
-
-    monkeypatch.setattr(mesh, "export", interrupted)
-    frames = recover(tmp_path, *names, "--meshes", tmp_path / "meshes", code=code)
-    assert [frame["file"] for frame in frames] == [str(name) for name in names[:2]]
-    assert [path.name for path in (tmp_path / "meshes").iterdir()] == ["a.glb"]
-    assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
-    errors = capsys.readouterr().err
-    assert words in errors
-    assert "2 frames, 4 objects (0 failed), median" in errors
-
-
-def save_grown(path, share):
-    """The two bodies, grown by a share, with labels that say which way."""
-    bodies = Superquadric((1 + share) * BODIES.size, BODIES.shape, BODIES.translation, BODIES.rotation)
-    rendered, index = raycast.render(bodies, CAMERA)
-    labels = np.array([0, 1, 2] if share > 0 else [0, 2, 1])[index + 1]
-    depth = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
-    np.savez(path, depth=depth, K=CAMERA.matrix, labels=labels)
-
-
 def test_track_puts_ids_into_the_json(tmp_path, capsys):
     """Masks change their labels and bodies their sizes from frame to frame; names that are times are stamps."""
     folder = tmp_path / "frames"
-    folder.mkdir()
-    for k in range(4):
-        save_grown(folder / f"1305031102.{k}.npz", 0.02 * (-1) ** k)
+    for k, labels in enumerate(2 * [[0, 1, 2], [0, 2, 1]]):
+        grown = Superquadric((1 + 0.02 * (-1) ** k) * BODIES.size, BODIES.shape, BODIES.translation, BODIES.rotation)
+        save_npz(folder / f"1305031102.{k}.npz", bodies=grown, labels=labels)
     frames = recover(tmp_path, folder, "--track", "--time-budget", "10")
     assert [frame["stamp"] for frame in frames] == [{"sec": 1305031102, "nanosec": k * 10**8} for k in range(4)]
     assert "no stamp" not in capsys.readouterr().err
@@ -445,10 +362,9 @@ def test_poses_make_one_scene_of_several_cameras(tmp_path, capsys, validate):
     for k in range(4):
         turn = quaternions.from_rotation_vector(np.array([0.0, 0.5 * k, 0.0]))
         position = middle - quaternions.to_matrix(turn) @ middle
-        names.append(tmp_path / f"camera{k}" / "depth.npz")
-        names[k].parent.mkdir()
         back = quaternions.conjugate(turn)
-        save_npz(names[k], bodies=BODIES.transformed(back, -quaternions.to_matrix(back) @ position))
+        seen = BODIES.transformed(back, -quaternions.to_matrix(back) @ position)
+        names.append(save_npz(tmp_path / f"camera{k}" / "depth.npz", bodies=seen))
         poses.append(f"{names[k]} " + " ".join(map(str, [*(position + world), *turn])))
     file = tmp_path / "poses.txt"
     file.write_text("# name tx ty tz qx qy qz qw\n" + "\n".join(poses))
@@ -473,10 +389,8 @@ def test_poses_make_one_scene_of_several_cameras(tmp_path, capsys, validate):
 
 
 def test_track_is_asked_for_and_says_where_stamps_are_missing(tmp_path, capsys):
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        for k in range(2):
-            save_npz(tmp_path / folder / f"f{k}.npz")
+    for name in ("a/f0.npz", "a/f1.npz", "b/f0.npz", "b/f1.npz"):
+        save_npz(tmp_path / name)
     plain = recover(tmp_path, tmp_path / "a")
     assert all(one["track"] is None for frame in plain for one in frame["superquadrics"])
     assert plain[0]["stamp"] is None
@@ -491,7 +405,6 @@ def test_a_still_scene_is_recovered_anew_in_each_folder(tmp_path):
     rendered, _ = raycast.render(BODIES, CAMERA)
     rng = np.random.default_rng(1)
     for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
         depth = np.where(np.isfinite(rendered), rendered + rng.normal(0, 1e-3, rendered.shape), np.nan)
         save_npz(tmp_path / folder / "f.npz", depth.astype(np.float32))
     first, second = recover(tmp_path, tmp_path / "a", tmp_path / "b", "--track")
@@ -534,154 +447,3 @@ def test_a_workspace_may_have_no_end(tmp_path, lowest):
 def test_a_message_is_one_printable_line(capsys):
     complain("a\x1b[2J\nb")
     assert capsys.readouterr().err == "sq-perception: a?[2J b\n"
-
-
-# what is there already
-
-
-def interrupt_after(frames, monkeypatch):
-    """Ctrl-C while the frame after so many is worked on."""
-    from sq_perception.recordings import result_json as module
-
-    entry, calls = module.frame_entry, []
-
-    def interrupted(*arguments, **options):
-        if len(calls) == frames:
-            raise KeyboardInterrupt
-        calls.append(0)
-        return entry(*arguments, **options)
-
-    monkeypatch.setattr(module, "frame_entry", interrupted)
-
-
-def test_a_good_document_outlives_a_run_without_a_frame_and_an_interrupted_one(tmp_path, monkeypatch, capsys):
-    out = tmp_path / "keep.json"
-    out.write_text("good")
-    assert run(tmp_path / "missing.npz", "--json", out) == 1
-    assert out.read_text() == "good"
-    assert f"{out} stays as it is" in capsys.readouterr().err
-    names = [save_npz(tmp_path / f"{name}.npz") for name in ("a", "b")]
-    interrupt_after(1, monkeypatch)
-    assert run(*names, "--json", out) == 130
-    assert out.read_text() == "good"
-    assert len(json.loads((tmp_path / "keep.partial.json").read_text())["frames"]) == 1
-    assert "keep.partial.json" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("option", ["--json", "--jsonl"])
-def test_links_and_devices_are_written_through(tmp_path, option):
-    frame = save_npz(tmp_path / "a.npz")
-    for name, target in (("null", "/dev/null"), ("link", "target")):
-        (tmp_path / name).symlink_to(target)
-        assert run(frame, option, tmp_path / name) == 0
-        assert (tmp_path / name).is_symlink()
-    first = (tmp_path / "target").read_text()
-    assert json.loads(first if option == "--json" else first.splitlines()[0])["format"] == "sq_perception.recovery"
-
-
-@pytest.mark.parametrize("option", ["--json", "--jsonl", "--mcap", "--pictures", "--meshes"])
-def test_what_cannot_be_written_is_known_before_a_frame_is_computed(tmp_path, option, monkeypatch, capsys):
-    monkeypatch.setattr(Recoverer, "recover", None)
-    frame = save_npz(tmp_path / "a.npz")
-    assert run(frame, option, "/proc/sys/out.mcap") == 2
-    assert option in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("option", ["--mcap", "--html"])
-def test_weights_damaged_beyond_their_header_leave_nothing_behind(tmp_path, option, capsys):
-    model, outputs = tmp_path / "damaged.safetensors", tmp_path / "outputs"
-    outputs.mkdir()
-    model.write_bytes(checkpoint.resolve(None).read_bytes()[:-1000] + 1000 * b"\xff")
-    frame, out = save_npz(tmp_path / "a.npz"), outputs / f"out.{option[2:]}"
-    assert main.main(["recover", str(frame), "--model", str(model), option, str(out)]) == 1
-    assert "not all finite" in capsys.readouterr().err
-    assert not list(outputs.iterdir())
-
-
-def test_a_bag_that_was_begun_is_forgotten_where_the_page_cannot_be(tmp_path, monkeypatch, capsys):
-    def full(path):
-        raise OSError(28, "No space left on device", str(path))
-
-    monkeypatch.setattr(html_page, "HtmlPage", full)
-    frame, outputs = save_npz(tmp_path / "a.npz"), tmp_path / "outputs"
-    outputs.mkdir()
-    assert run(frame, "--mcap", outputs / "out.mcap", "--html", outputs / "out.html") == 1
-    assert "No space left" in capsys.readouterr().err
-    assert not list(outputs.iterdir())
-
-
-def test_what_is_read_is_not_replaced(tmp_path, capsys):
-    """Files that were named, and masks, cameras and the parts of a bag that are read for them."""
-    frame, png = save_npz(tmp_path / "a.npz"), save_png(tmp_path / "b.png")
-    camera = camera_yaml(tmp_path / "camera.yaml")
-    masks, bag = tmp_path / "masks", tmp_path / "bag"
-    masks.mkdir(), bag.mkdir()
-    cv2.imwrite(str(masks / "b.png"), np.ones((120, 160), np.uint8))
-    for name in ("metadata.yaml", "bag.mcap"):
-        (bag / name).write_text("recorded")
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-    for arguments in (
-        (frame, "--json", frame),
-        (frame, "--jsonl", frame),
-        (png, "--camera-info", camera, "--json", camera),
-        (tmp_path, "--json", camera),
-        (tmp_path, "--pictures", tmp_path),
-        (png, "--masks", masks, "--pictures", masks),
-        (bag, "--mcap", bag / "bag.mcap"),
-    ):
-        assert run(*arguments) == 2
-        assert "input" in capsys.readouterr().err
-    assert {path: path.read_bytes() for path in before} == before
-
-
-def test_no_output_takes_the_place_of_another(tmp_path, capsys):
-    frame, out = save_npz(tmp_path / "a.npz"), tmp_path / "out.json"
-    assert main.main(["recover", str(frame), "--json", str(out), "--jsonl", f"{tmp_path}/./out.json"]) == 2
-    assert "--json, --jsonl: " in capsys.readouterr().err
-    assert not out.exists()
-    assert main.main(["recover", str(frame), "--json", "/dev/null", "--csv", "/dev/null"]) == 0
-
-
-def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch, capsys):
-    """Interrupted after two of five frames, then again to the end: every frame once, in order, computed once."""
-    folder = tmp_path / "frames"
-    folder.mkdir()
-    for k in range(5):
-        save_npz(folder / f"f{k}.npz")
-    lines, out, meshes = tmp_path / "out.jsonl", tmp_path / "out.json", tmp_path / "meshes"
-    with monkeypatch.context() as context:
-        interrupt_after(2, context)
-        assert run(folder, "--jsonl", lines, "--meshes", meshes) == 130
-    first = lines.read_text()
-    assert len(first.splitlines()) == 3
-    assert run(folder, "--jsonl", lines, "--meshes", meshes, "--json", out) == 0
-    assert lines.read_text().startswith(first), "what is done is not done again"
-    frames = [json.loads(line) for line in lines.read_text().splitlines()[1:]]
-    assert [frame["file"] for frame in frames] == [str(folder / f"f{k}.npz") for k in range(5)]
-    assert json.loads(out.read_text())["frames"] == frames
-    assert sorted(path.name for path in meshes.iterdir()) == [f"f{k}.glb" for k in range(5)]
-    monkeypatch.setattr(Recoverer, "recover", None)
-    assert run(folder, "--jsonl", lines) == 0, "nothing is left to do"
-    assert f"0 frames, 0 objects (0 failed), 5 frames in {lines} before" in capsys.readouterr().err
-    assert run(folder, "--jsonl", lines, "--max-objects", "3") == 2
-    assert run(folder, "--jsonl", lines, "--workspace", *"001112") == 2
-    assert run(folder, "--jsonl", lines, "--mcap", tmp_path / "out.mcap") == 2
-
-
-def test_pictures_of_a_resumed_run_keep_their_names(tmp_path, monkeypatch):
-    """Three frames of one name; after the first there are two left, and they do not take its picture's place."""
-    monkeypatch.setattr(recover_outputs, "_draw", lambda path, *_: path.write_bytes(b""))
-    frames = [tmp_path / name / "f.npz" for name in "abc"]
-    for frame in frames:
-        frame.parent.mkdir()
-        save_npz(frame)
-    lines, pictures = tmp_path / "out.jsonl", tmp_path / "pictures"
-    with monkeypatch.context() as context:
-        interrupt_after(1, context)
-        assert run(*frames, "--jsonl", lines, "--pictures", pictures) == 130
-    assert [path.name for path in pictures.iterdir()] == ["f.png"]
-    first = (pictures / "f.png").stat().st_mtime_ns
-    assert run(*frames[:2], "--jsonl", lines, "--pictures", pictures) == 0
-    assert run(*frames, "--jsonl", lines, "--pictures", pictures) == 0
-    assert sorted(path.name for path in pictures.iterdir()) == ["f.png", "f_2.png", "f_3.png"]
-    assert (pictures / "f.png").stat().st_mtime_ns == first

@@ -27,6 +27,14 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 FRAME_ID = "some_camera_optical_frame"
 
+BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
+CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
+DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] + [0.02, 0.03, 0.04]))
+
+
+def recovered(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
+    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
+
 
 def ball(label: int = 1, status: Status = Status.CONVERGED, radius: float = 0.1) -> Recovery:
     body = Superquadric(np.full(3, radius), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
@@ -130,16 +138,16 @@ class Bench(SpunNodes):
         self.infos.publish(message)
         self.until(lambda: len(self.node._input._infos) > before)
 
-    def send(self, message: Image) -> Any:
+    def send(self, message: Any, publisher: Any = None) -> Any:
         """Publish an image and wait for its verdict: the counts after it."""
         before = self.counts
-        self.images.publish(message)
+        (publisher or self.images).publish(message)
         self.until(lambda: self.counts.received > before.received and self.counts.in_work == 0)
         return self.counts
 
-    def answer(self, message: Image) -> tuple[PointCloud2, SuperquadricArray]:
+    def answer(self, message: Any, publisher: Any = None) -> tuple[PointCloud2, SuperquadricArray]:
         """Publish a good image; the published result."""
         before = len(self.answers)
-        self.send(message)
+        self.send(message, publisher)
         self.until(lambda: len(self.answers) > before)
         return self.answers[-1], from_message(self.answers[-1])

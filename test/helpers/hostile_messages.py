@@ -173,18 +173,8 @@ def broken_images(draw: st.DrawFn, encodings: tuple[str, ...] = _DEPTH) -> Image
     return image
 
 
-_IMAGES = {encodings: st.one_of(_SOUND[encodings], broken_images(encodings)) for encodings in (_DEPTH, _LABELS)}
-
-
-def images() -> st.SearchStrategy[Image]:
-    """Depth images, sound ones and broken ones."""
-    return _IMAGES[_DEPTH]
-
-
-def masks() -> st.SearchStrategy[Image]:
-    """Label images, sound ones and broken ones."""
-    return _IMAGES[_LABELS]
-
+IMAGES, MASKS = (st.one_of(_SOUND[encodings], broken_images(encodings)) for encodings in (_DEPTH, _LABELS))
+"""Depth images and label images, sound ones and broken ones."""
 
 @st.composite
 def hostile_infos(draw: st.DrawFn, width: int, height: int, header: Header) -> CameraInfo:
@@ -216,7 +206,7 @@ def sound_info(image: Image) -> CameraInfo:
 @st.composite
 def frames(draw: st.DrawFn, *, masked: bool = False) -> HostileFrame:
     """Frames with at least one thing to object to, or to survive."""
-    image = draw(_IMAGES[_DEPTH])
+    image = draw(IMAGES)
     kind = draw(_INFO)
     info: CameraInfo | None = sound_info(image)
     if kind == "hostile":
@@ -226,7 +216,7 @@ def frames(draw: st.DrawFn, *, masked: bool = False) -> HostileFrame:
         info = None if kind == "none" else sound_info(Image(width=17, height=23))
     mask = None
     if masked:
-        mask = draw(_IMAGES[_LABELS])
+        mask = draw(MASKS)
         if draw(_DIE) < 7:
             mask = _of_size(mask, image)
         if draw(_DIE):

@@ -7,11 +7,6 @@ the first result that needs the killed process, and the longest silence of those
 from __future__ import annotations
 
 import math
-import os
-import signal
-import subprocess
-import sys
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,12 +20,14 @@ from started_nodes import Child
 
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"
 MEMBERS = (CAMERA, NODE, VIEWER)
-_VIEWER = """
+_SEEN = "seen at "
+_VIEWER = f"""
+import time
 import rclpy
 from sensor_msgs.msg import PointCloud2
 rclpy.init()
 node = rclpy.create_node("viewer")
-node.create_subscription(PointCloud2, {topic!r}, lambda message: print(message.width, flush=True), 10)
+node.create_subscription(PointCloud2, {{topic!r}}, lambda _: print("{_SEEN}", time.monotonic(), flush=True), 10)
 rclpy.spin(node)
 """
 _DEAF = 30.0
@@ -43,39 +40,17 @@ class NotBackError(Exception):
     """A process was started again and does not work."""
 
 
-class Viewer:
-    """A process that prints a line for each result it sees."""
+class Viewer(Child):
+    """A process that prints the time of each result that it sees."""
 
-    def __init__(self, command: Sequence[str]) -> None:
-        self.times: list[float] = []
-        self._process = subprocess.Popen(
-            list(command), env=environment(PYTHONUNBUFFERED="1"), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL, text=True, start_new_session=True,
-        )
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
+    def __init__(self, topic: str) -> None:
+        super().__init__("viewer", [], environment(), _VIEWER.format(topic=topic))
 
     @property
-    def pid(self) -> int:
-        return self._process.pid
-
-    @property
-    def exit_code(self) -> int | None:
-        """None while it runs."""
-        return self._process.poll()
-
-    def kill(self) -> None:
-        """End it and all that it started."""
-        if self.exit_code is None:
-            os.killpg(self.pid, signal.SIGKILL)
-        self._process.wait()
-        self._reader.join()
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for _ in lines:
-                self.times.append(time.monotonic())
+    def times(self) -> list[float]:
+        """Seconds of the monotonic clock, which is that of all processes."""
+        whole = self.output().rpartition("\n")[0]  # the last line may not be complete
+        return [float(line.removeprefix(_SEEN)) for line in whole.splitlines() if line.startswith(_SEEN)]
 
 
 @dataclass(frozen=True)
@@ -101,7 +76,6 @@ class Robot:
     ) -> None:
         self._peer, self._node = peer, node
         self._camera, self._parameters = tuple(camera), tuple(parameters)
-        self._viewer = (sys.executable, "-c", _VIEWER.format(topic=f"/{node}/superquadrics"))
         self.running: dict[str, Any] = {}
         self.answers, self.diagnoses = peer.answers(f"/{node}"), peer.diagnoses(f"/{node}")
         self.infos: list[float] = []
@@ -122,7 +96,7 @@ class Robot:
     def start(self, member: str) -> None:
         """Start one of the three."""
         if member == VIEWER:
-            self.running[member] = Viewer(self._viewer)
+            self.running[member] = Viewer(f"/{self._node}/superquadrics")
         elif member == CAMERA:
             words = [*arguments(*self._camera), "--log-level", "warn"]
             self.running[member] = Child("synthetic_depth_node", words, environment(NUMBA_NUM_THREADS="1"))
@@ -156,8 +130,7 @@ class Robot:
     def _wait(self, member: str, started: float) -> float:
         wall = time.time() - (time.monotonic() - started)
         if member == VIEWER:
-            times = self.running[VIEWER].times
-            return self._until(lambda: times and times[0]) - started
+            return self._until(lambda: next(iter(self.running[VIEWER].times), 0.0)) - started
         seen = len(self.answers)
 
         def answered() -> float:
@@ -165,8 +138,7 @@ class Robot:
             return next((one.time for one in self.answers[seen:] if 1e-9 * one.stamp > wall), 0.0)
 
         back = self._until(answered)
-        watched = self.running[VIEWER]
-        self._until(lambda: watched.times and watched.times[-1] >= back - 1.0)
+        self._until(lambda: max(self.running[VIEWER].times, default=0.0) >= back - 1.0)
         return back - started
 
     def _until(self, condition: Callable[[], float]) -> float:

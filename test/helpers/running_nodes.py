@@ -56,8 +56,8 @@ def until(condition: Callable[[], Any], alive: Sequence[Child] = (), patience: f
     while not (result := condition()):
         for child in alive:
             assert child.exit_code is None, f"{child.name} ended:\n" + "\n".join(child.last_lines())
-        said = "\n".join(line for child in alive for line in child.last_lines())
-        assert time.monotonic() < deadline, f"waited {patience:g} s in vain\n{said}"
+        if time.monotonic() > deadline:
+            raise AssertionError("\n".join([f"waited {patience:g} s in vain", *(child.output() for child in alive)]))
         time.sleep(0.002)
     return result
 
@@ -110,32 +110,26 @@ class Call:
     milliseconds: float
 
 
-class Peer:
+class Peer(SpunNodes):
     """A node in this process, spun in the background, that publishes, listens and calls."""
 
     def __init__(self) -> None:
         os.environ.update(process.additions())
-        self._spun = SpunNodes()
-        self.node = self._spun.peer
+        super().__init__()
+        self.node = self.peer
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
         self._answers: dict[str, list[Answer]] = {}
         self._diagnoses: dict[str, list[Diagnosis]] = {}
-        self._spun.spin([])
+        self.spin([])
         self.listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
-
-    def __enter__(self) -> Peer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._spun.close()
 
     # Listening
 
     def listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None], depth: int = 50) -> None:
         """Subscribe; the callback runs in the background thread."""
         self.node.create_subscription(kind, topic, callback, depth)
-        self._spun.executor.wake()
+        self.executor.wake()
 
     def answers(self, node: str) -> list[Answer]:
         """The results of a node ("/recover_node"), growing from the first call on."""
@@ -183,7 +177,7 @@ class Peer:
         """Call a service; the future holds the response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-            self._spun.executor.wake()
+            self.executor.wake()
         until(self._clients[name].service_is_ready, alive)
         return self._clients[name].call_async(request)
 
@@ -267,15 +261,7 @@ def _absolute(topic: str) -> str:
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process holds at one moment.
-
-    Attributes
-    ----------
-    rss
-        Resident memory, MB.
-    threads, files, segments
-        Counts; segments are the files of Fast DDS that it maps.
-    """
+    """What a process holds: resident memory, MB, and counts; segments are the files of Fast DDS that it maps."""
 
     rss: float
     threads: int
@@ -284,13 +270,7 @@ class Usage:
 
 
 def usage(pid: int) -> Usage:
-    """Read from /proc.
-
-    Raises
-    ------
-    OSError
-        If there is no such process.
-    """
+    """Read from /proc; OSError if there is no such process."""
     place = Path("/proc") / str(pid)
     lines = (line.split(":", 1) for line in (place / "status").read_text().splitlines())
     status = {key: value.split() for key, value in lines}

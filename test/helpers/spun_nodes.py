@@ -13,6 +13,7 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.task import Future
 
 PATIENCE = 30.0
@@ -28,22 +29,12 @@ class SpunNodes:
 
     def spin(self, nodes: Sequence[Node], executor: Any = None) -> None:
         """Spin the nodes and the peer by an executor of that class."""
-        self._all: list[Node] = []
+        self._all = (*nodes, self.peer)
         self.executor = (executor or SingleThreadedExecutor)(context=self.context)
-        for node in (*nodes, self.peer):
-            self.add(node)
+        for node in self._all:
+            self.executor.add_node(node)
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.thread.start()
-
-    def add(self, node: Node) -> None:
-        """Spin one more."""
-        self._all.append(node)
-        self.executor.add_node(node)
-
-    def remove(self, node: Node) -> None:
-        """Spin that one no longer; it remains to be destroyed."""
-        self._all.remove(node)
-        self.executor.remove_node(node)
 
     def _spin(self) -> None:
         try:
@@ -70,6 +61,12 @@ class SpunNodes:
         # An events executor keeps what it was waiting for until it is collected, and the next nodes would hear of it.
         del self.executor
         gc.collect()
+
+    @staticmethod
+    def set(node: Node, **values: Any) -> None:
+        """Set parameters of a node one by one, which it has to accept."""
+        for result in node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
+            assert result.successful, result.reason
 
     @staticmethod
     def until(condition: Callable[[], Any]) -> None:

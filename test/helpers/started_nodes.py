@@ -20,20 +20,23 @@ import sq_perception
 
 _PATIENCE = 8.0
 """Seconds for all children together to end after an interrupt: a lifecycle node waits 4 s for its transition."""
-_TAIL = 2**14
-"""Bytes of a node's output that are looked at."""
 _ROOT = str(Path(sq_perception.__file__).resolve().parent.parent)
 _CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import executables as e; sys.exit(e.{node}())"
 
 
 class Child(subprocess.Popen[bytes]):
-    """One running node of :mod:`sq_perception.nodes.executables`; the environment is this process's if not given."""
+    """One running node of :mod:`sq_perception.nodes.executables`, or other ``code``.
 
-    def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+    The environment is this process's if not given.
+    """
+
+    def __init__(
+        self, node: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None, code: str = ""
+    ) -> None:
         self.name = node
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
         super().__init__(
-            command(node, arguments),
+            [sys.executable, "-c", code or _CODE.format(root=_ROOT, node=node), *arguments],
             env={**(os.environ if environment is None else environment), "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL, stdout=self._output, stderr=subprocess.STDOUT, start_new_session=True,
         )
@@ -43,11 +46,12 @@ class Child(subprocess.Popen[bytes]):
         """None while it runs."""
         return self.poll()
 
+    def output(self) -> str:
+        """All that it has said on standard output and error."""
+        return os.pread(self._output.fileno(), 2**24, 0).decode(errors="replace")
+
     def last_lines(self) -> list[str]:
-        """The last lines of its standard output and error."""
-        number = self._output.fileno()
-        tail = os.pread(number, _TAIL, max(0, os.fstat(number).st_size - _TAIL))
-        return tail.decode(errors="replace").splitlines()[-15:]
+        return self.output().splitlines()[-15:]
 
     def interrupt(self) -> None:
         """Interrupt it and all that it started, as Ctrl-C does."""
@@ -96,8 +100,3 @@ class Children:
         child = Child(node, arguments, self._environment)
         self._running.append(child)
         return child
-
-
-def command(node: str, arguments: Sequence[str] = ()) -> list[str]:
-    """The command line that runs a node by this interpreter, from this package."""
-    return [sys.executable, "-c", _CODE.format(root=_ROOT, node=node), *arguments]

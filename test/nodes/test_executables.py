@@ -42,6 +42,22 @@ def test_a_word_that_is_not_for_ros_is_refused() -> None:
     assert "unrecognized arguments: -p model:=mine.safetensors" in done.stderr
 
 
+@pytest.mark.parametrize("call", [["recover_node"], ["grasp_node"], ["recover_cameras", "front"]])
+def test_without_rclpy_a_program_says_what_is_missing(call: list[str]) -> None:
+    done = run(*call, before="sys.modules['rclpy'] = None")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+    assert "needs ROS 2 in Python: pip install 'sq_perception[ros]'" in done.stderr
+
+
+def test_an_rclpy_that_cannot_be_imported_leaves_one_traceback(tmp_path: Path) -> None:
+    """As one of another Python, whose compiled part is not found."""
+    (tmp_path / "rclpy").mkdir()
+    (tmp_path / "rclpy" / "__init__.py").write_text("raise ImportError('no compiled part')")
+    done = run("recover_node", before=f"sys.path[:0] = [{str(tmp_path)!r}]")
+    assert (done.returncode, done.stderr.count("Traceback")) == (1, 1), done.stderr
+    assert done.stderr.endswith("ImportError: no compiled part\n")
+
+
 INTERRUPT = "import os, signal; os.kill(os.getpid(), signal.SIGINT)"
 DURING = f"""
 class Hook:

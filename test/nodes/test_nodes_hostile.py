@@ -12,7 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from hostile_messages import HostileFrame, Siege, difference, frames, hostile_infos, images, masks, sound_info
+from hostile_messages import IMAGES, MASKS, HostileFrame, Siege, difference, frames, hostile_infos, sound_info
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from running_nodes import Peer, arguments, environment, until
@@ -41,7 +41,7 @@ def read(reader: Callable[[Any], Any], message: Any) -> tuple[Any, str]:
 
 
 @QUICK
-@given(images())
+@given(IMAGES)
 def test_a_depth_image_is_read_whole_or_refused_with_its_field(message):
     depth, words = read(lambda one: publication.depth_of(one, False)[0].depth, message)
     if depth is None:
@@ -55,7 +55,7 @@ def test_a_depth_image_is_read_whole_or_refused_with_its_field(message):
 
 
 @QUICK
-@given(masks())
+@given(MASKS)
 def test_a_mask_is_read_whole_or_refused_with_its_field(message):
     labels, words = read(labels_from_message, message)
     if labels is None:

@@ -13,7 +13,6 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from frame_node_bench import CAMERA, Bench
 from packed_depth import pack
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from spun_nodes import SpunNodes
 from stand_in_tf2 import Tf2
@@ -33,20 +32,16 @@ def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
     depth[:5] = np.nan
     for encoding in ("16UC1", "32FC1"):
         form, data = pack(depth, encoding)
-        header = bench.header()
-        packed.publish(CompressedImage(header=header, format=form, data=data))
-        bench.until(lambda header=header: any(one.header == header for one in bench.answers))
+        bench.answer(CompressedImage(header=bench.header(), format=form, data=data), packed)
         seen = bench.recoverer.asked[-1][0]
         assert np.isnan(seen[:5]).all()
         np.testing.assert_allclose(seen[5:], 0.731, atol=1e-3)
     hostile = [("", b""), ("16UC1; compressedDepth png", b""), (form, data[:40]), ("rgb8; jpeg", b"abc")]
     for number, (bad_form, bad_data) in enumerate(hostile, start=1):
-        packed.publish(CompressedImage(header=bench.header(), format=bad_form, data=bad_data))
-        bench.until(lambda number=number: bench.counts.refused == number)
-        assert bench.counts.last_error
-    header = bench.header()
-    packed.publish(CompressedImage(header=header, format=form, data=data))
-    bench.until(lambda: any(one.header == header for one in bench.answers))
+        counts = bench.send(CompressedImage(header=bench.header(), format=bad_form, data=bad_data), packed)
+        assert counts.refused == number
+        assert counts.last_error
+    bench.answer(CompressedImage(header=bench.header(), format=form, data=data), packed)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +65,7 @@ def test_units_marks_and_ranges_are_read_as_in_files(make_bench, monkeypatch):
     bench.send_info()
     bench.answer(bench.depth(value=500.0))
     np.testing.assert_allclose(bench.recoverer.asked[-1][0], 0.5)
-    bench.node.set_parameters([Parameter("depth_scale", value=0.0)])
+    bench.set(bench.node, depth_scale=0.0)
     infos: list[str] = []
     monkeypatch.setattr(bench.node.get_logger(), "info", lambda text, **_: infos.append(text))
     depth = np.full((48, 64), 0.5)
@@ -78,7 +73,7 @@ def test_units_marks_and_ranges_are_read_as_in_files(make_bench, monkeypatch):
     bench.answer(depth_to_message(depth, bench.header()))
     np.testing.assert_array_equal(np.isnan(bench.recoverer.asked[-1][0]), depth == 10)
     assert any("10 m is taken for no reading" in text for text in infos)
-    bench.node.set_parameters([Parameter("depth_kind", value="range")])
+    bench.set(bench.node, depth_kind="range")
     bench.answer(bench.depth(value=0.5))
     seen, camera, _, _ = bench.recoverer.asked[-1]
     np.testing.assert_allclose(np.linalg.norm(camera.points(seen), axis=2), 0.5, rtol=1e-6)
@@ -156,8 +151,7 @@ def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make
     points[5, :9] = 0.0  # what some drivers send for nothing
 
     def answered(message: PointCloud2) -> tuple:
-        clouds.publish(message)
-        bench.until(lambda: any(one.header == message.header for one in bench.answers))
+        bench.answer(message, clouds)
         return bench.recoverer.asked[-1]
 
     seen, camera, labels, options = answered(cloud(points, bench.header()))
@@ -179,8 +173,7 @@ def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make
     nowhere.fields[3].offset = 30
     behind, nothing = cloud(-points, bench.header()), cloud(points[:0], bench.header())
     for number, hostile in enumerate((unnamed, short, nowhere, behind, nothing), start=1):
-        clouds.publish(hostile)
-        bench.until(lambda number=number: bench.counts.refused == number)
+        assert bench.send(hostile, clouds).refused == number
     answered(cloud(points, bench.header()))
 
 
@@ -193,13 +186,10 @@ def test_a_cloud_that_is_no_image_has_pixels_of_no_mask(make_bench):
     row = cloud(points[None], bench.header())
 
     def decided(use: str) -> SimpleNamespace:
-        assert bench.node.set_parameters([Parameter("use_masks", value=use)])[0].successful
+        bench.set(bench.node, use_masks=use)
         row.header = bench.header()
         masks.publish(labels_to_message(np.ones((48, 64), np.int32), row.header))
-        before = bench.counts
-        clouds.publish(row)
-        bench.until(lambda: bench.counts.received > before.received and bench.counts.in_work == 0)
-        return bench.counts
+        return bench.send(row, clouds)
 
     counts = decided("auto")
     assert (counts.answered, counts.refused) == (1, 0), counts.last_error
@@ -228,18 +218,14 @@ def test_labels_of_points_are_masks_and_points_of_another_frame_are_moved_by_tf(
         header.frame_id = frame_id
         return cloud(there, header, labels)
 
-    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
-    clouds.publish(labelled("base"))
-    bench.until(lambda: bench.answers)
-    assert bench.answers[-1].header.frame_id == "camera_optical"
+    bench.set(bench.node, use_masks="always")
+    assert bench.answer(labelled("base"), clouds)[0].header.frame_id == "camera_optical"
     image, camera, masks, _ = bench.recoverer.asked[-1]
     np.testing.assert_allclose(image, depth, rtol=1e-5)
     assert camera.fx == pytest.approx(CAMERA.fx, rel=1e-3)
     np.testing.assert_array_equal(masks, labels)
-    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
-    clouds.publish(labelled("base"))
-    bench.until(lambda: len(bench.answers) == 2)
+    bench.set(bench.node, use_masks="never")
+    bench.answer(labelled("base"), clouds)
     assert bench.recoverer.asked[-1][2] is None
-    clouds.publish(labelled("map"))
-    bench.until(lambda: bench.counts.refused)
-    assert "camera_frame: expected a transform from 'map' to 'camera_optical'" in bench.counts.last_error
+    expected = "camera_frame: expected a transform from 'map' to 'camera_optical'"
+    assert expected in bench.send(labelled("map"), clouds).last_error

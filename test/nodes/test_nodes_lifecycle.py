@@ -103,6 +103,12 @@ class Bench(SpunNodes):
         request = ChangeState.Request(transition=Transition(id=transition, label=label))
         return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
 
+    def led_up(self) -> Bench:
+        """Configured and activated, as by a manager."""
+        assert self.change(Transition.TRANSITION_CONFIGURE)
+        assert self.change(Transition.TRANSITION_ACTIVATE)
+        return self.active()
+
     def state(self) -> str:
         return str(self.call(GetState, "/recover_node/get_state").current_state.label)
 
@@ -179,9 +185,7 @@ class TestLifecycle:
         bench.made.clear()
         gc.collect()
         assert watched() is None, "the network is still in memory after the cleanup"
-        assert bench.change(Transition.TRANSITION_CONFIGURE)
-        assert bench.change(Transition.TRANSITION_ACTIVATE)
-        assert bench.active().answer() == 1.0
+        assert bench.led_up().answer() == 1.0
         assert len(bench.made) == 1
         assert bench.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert bench.state() == "finalized"
@@ -190,8 +194,8 @@ class TestLifecycle:
         bench = make_bench("-p", "autostart:=false")
         assert bench.state() == "unconfigured"
         assert not bench.made
-        assert bench.node.set_parameters([Parameter("projection", value="orthographic")])[0].successful
-        assert bench.node.set_parameters([Parameter("projection", value="pinhole")])[0].successful
+        for projection in ("orthographic", "pinhole"):
+            bench.set(bench.node, projection=projection)
         bench.report(lambda one: one.level == DiagnosticStatus.OK and one.message == "unconfigured")
         assert bench.change(Transition.TRANSITION_CONFIGURE)
         assert bench.state() == "inactive"
@@ -233,9 +237,7 @@ class TestLifecycle:
         reason = "cannot configure: weights.safetensors: no such model file"
         bench.report(lambda one: one.level == DiagnosticStatus.ERROR and one.message == f"unconfigured: {reason}")
         bench.fault = None
-        assert bench.change(Transition.TRANSITION_CONFIGURE)
-        assert bench.change(Transition.TRANSITION_ACTIVATE)
-        assert bench.active().answer() == 1.0
+        assert bench.led_up().answer() == 1.0
         bench.report(lambda one: one.level == DiagnosticStatus.OK)
 
     def test_an_autostart_that_fails_is_told_to_the_process(self, make_bench):
@@ -290,14 +292,15 @@ class TestLifecycle:
         assert bench.node.state == "finalized"
         assert withdrawn == ["deactivating"]
 
+
 class TestSwap:
     def test_the_next_frame_has_the_model_that_was_set_last(self, make_bench):
         bench = make_bench().active()
-        assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful
+        bench.set(bench.node, s=3)
         assert bench.answer() == 1.0
         assert len(bench.made) == 1, "what does not concern the recoverer swaps nothing"
         for model in ("2", "4", "3"):
-            assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
+            bench.set(bench.node, model=model)
         assert bench.answer() == 3.0
         assert bench.node._engine.description == "method auto, 3 on cpu"
         assert len(bench.made) == 2
@@ -308,12 +311,12 @@ class TestSwap:
         refused = bench.node.set_parameters([Parameter("model", value="bad")])[0]
         assert (refused.successful, refused.reason) == (False, "model: bad is no model")
         bench.fault = MemoryError("no room for weights")
-        assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        bench.set(bench.node, model="4")
         assert bench.answer() == 1.0
         reason = "cannot change to method auto, 4 on cpu: no room for weights"
         bench.report(lambda one: one.level == DiagnosticStatus.WARN and one.message == reason)
         bench.fault = None
-        assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        bench.set(bench.node, model="4")
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
 
@@ -322,9 +325,10 @@ class TestSwap:
         bench.gate.clear()
         bench.node.start()
         bench.until(lambda: bench.node.state == "configuring")
-        assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
+        bench.set(bench.node, model="6")
         bench.gate.set()
         assert bench.active().answer() == 6.0
+
 
 class TestSeveralCameras:
     @pytest.mark.parametrize("executor", [SingleThreadedExecutor, MultiThreadedExecutor, EventsExecutor])
@@ -337,7 +341,7 @@ class TestSeveralCameras:
                 assert bench.answer(space) == 1.0
         for space in ("front", "wrist"):
             assert {one.header.frame_id for one in bench.answers[space]} == {f"{space}_camera"}
-        assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
+        bench.set(bench.nodes[1], model="7")
         assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0), "a swap leaves the other alone"
 
     def test_one_frame_at_a_time_and_nobody_starves(self, make_bench):
@@ -372,8 +376,7 @@ class TestSeveralCameras:
         bench = make_bench(namespaces=("front", "wrist")).active()
         bench.answer("wrist")
         box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
-        assert bench.nodes[1].set_parameters([Parameter("target_frame", value="base")])[0].successful
-        assert bench.nodes[1].set_parameters([Parameter("workspace", value=box)])[0].successful
+        bench.set(bench.nodes[1], target_frame="base", workspace=box)
         bench.publish("wrist")
         bench.until(waits.is_set)
         assert bench.answer("front") == 1.0
@@ -394,6 +397,7 @@ class TestSeveralCameras:
             (found,) = bench.peer.get_publishers_info_by_topic(f"/{space}/recover_node/support_plane")
             kept[space] = found.qos_profile.durability.name
         assert kept == {"front": "VOLATILE", "wrist": "TRANSIENT_LOCAL"}
+
 
 def test_masks_that_come_later_than_newer_images_are_waited_for(make_bench):
     bench = make_bench("-p", "use_masks:=always", "-p", "patience:=5.0").active()

@@ -8,7 +8,6 @@ import pytest
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from frame_node_bench import ball
-from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
@@ -18,7 +17,7 @@ from sq_perception.recordings import publication
 
 
 def test_pictures_are_made_while_somebody_listens(bench):
-    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
+    bench.set(bench.node, tracking=False)
     bench.recoverer.bodies = (ball(1), ball(5), ball(6, Status.FAILED))
     assert len(bench.answer(bench.depth())[1]) == 3
     shown = bench.hear(MarkerArray, "recover_node/markers")

@@ -15,10 +15,12 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 import soft_messages
 from builtin_interfaces.msg import Time
+from frame_node_bench import BOX, CAMERA, CAN
+from frame_node_bench import recovered as one
 from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -33,17 +35,9 @@ from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
-CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 HEADER = Header(stamp=Time(sec=10, nanosec=500_000_000), frame_id="camera")
-DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] + [0.02, 0.03, 0.04]))
-BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
-CAN = Superquadric([0.03, 0.03, 0.06], [0.1, 1.0], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
 TF, DETECTIONS, SCENE = "/tf", "~/detections", "~/planning_scene"
 ALL = RecoverParameters(publish_tf=True, publish_detections=True, publish_collision_objects=True)
-
-
-def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
-    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
 def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
@@ -213,6 +207,8 @@ def test_gone_objects_are_removed_and_hidden_ones_stay(node, outputs):
     assert objects(scene) == {"superquadric_6": add, "superquadric_1": remove}
     outputs.publish(found(6), replace(ALL, tf_prefix="new"))
     assert objects(scene) == {"new6": add, "superquadric_6": remove}
+    outputs.publish(found(6, header=Header(frame_id="map")), replace(ALL, tf_prefix="new"))
+    assert objects(scene) == {"new6": add}, "planners know it in another frame"
     count = len(scene.sent)
     outputs.publish(found(), ALL)
     outputs.publish(found(), ALL)
@@ -236,6 +232,7 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     for moved in (
         Superquadric(BOX.size, BOX.shape, BOX.translation + [0, 0, 0.003], BOX.rotation),
         Superquadric(BOX.size + [0.003, 0, 0], BOX.shape, BOX.translation, BOX.rotation),
+        Superquadric(BOX.size + 0.0018, BOX.shape, BOX.translation, BOX.rotation),  # whose corners move by more
         Superquadric(BOX.size, [0.9, 0.6], BOX.translation, BOX.rotation),
         Superquadric(BOX.size, BOX.shape, BOX.translation, [0.1, 0.2, 0.4, 0.9]),
     ):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 
@@ -29,10 +28,6 @@ BODY = BODIES[:1]
 
 class Process(Child):
     """A node, started as a user starts it."""
-
-    def output(self) -> str:
-        """All that it has said."""
-        return os.pread(self._output.fileno(), 2**24, 0).decode(errors="replace")
 
     def says(self, words: str) -> None:
         until(lambda: words in self.output(), (self,))

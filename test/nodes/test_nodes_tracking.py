@@ -14,8 +14,8 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from frame_node_bench import CAMERA, FRAME_ID, Bench
-from rclpy.parameter import Parameter
+from frame_node_bench import BOX, CAMERA, CAN, FRAME_ID, Bench
+from frame_node_bench import recovered as recovery
 from spun_nodes import PATIENCE
 from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
@@ -23,19 +23,9 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import depth_to_message
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.recovery.recoverer import Recovery
-
-DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001] * 3 + [0.02] * 3))
-BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
-CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
-
-
-def recovery(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
-    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
 def grown(body: Superquadric, share: float) -> Superquadric:
@@ -129,14 +119,14 @@ def test_another_method_ends_the_tracks(make_bench, capfd):
     for k, share in enumerate((0.0, 0.02)):
         bench.recoverer.bodies = (recovery(grown(BOX, share), 1),)
         assert bench.answer(image(10 + 0.1 * k))[1].id.tolist() == [1]
-    assert bench.node.set_parameters([Parameter("method", value="network")])[0].successful
+    bench.set(bench.node, method="network")
     bench.recoverer.bodies = (recovery(grown(BOX, 0.05), 1),)
     _, found = bench.answer(image(10.2))
     assert found.id.tolist() == [2]
     np.testing.assert_allclose(found.size[0], 1.05 * BOX.size, rtol=1e-6)
-    assert bench.node.set_parameters([Parameter("method", value="symmetry")])[0].successful
+    bench.set(bench.node, method="symmetry")
     assert bench.answer(image(10.3))[1].id.tolist() == [3]
-    assert bench.node.set_parameters([Parameter("s", value=50.0)])[0].successful
+    bench.set(bench.node, s=50.0)
     assert bench.answer(image(10.4))[1].id.tolist() == [3]
     assert capfd.readouterr().err.count("bodies come from another method or model") == 2
 
@@ -145,12 +135,12 @@ def test_without_tracking_ids_are_labels_and_each_frame_stands_for_itself(make_b
     bench = make_bench()
     bench.recoverer.bodies = (recovery(BOX, 5), recovery(CAN, 9, Status.FAILED))
     assert bench.answer(image(10.0))[1].id.tolist() == [1, 2**31 + 9]
-    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
+    bench.set(bench.node, tracking=False)
     bench.recoverer.bodies = (recovery(grown(BOX, 0.05), 5), recovery(CAN, 9, Status.FAILED))
     _, found = bench.answer(image(10.1))
     assert found.id.tolist() == [5, 9]
     np.testing.assert_allclose(found.size[0], 1.05 * BOX.size, rtol=1e-6)
-    assert bench.node.set_parameters([Parameter("tracking", value=True)])[0].successful
+    bench.set(bench.node, tracking=True)
     assert bench.answer(image(10.2))[1].id.tolist() == [2, 2**31 + 9]
 
 
@@ -256,8 +246,3 @@ def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
         np.testing.assert_allclose(found.size[0], (1 + share) * BOX.size, rtol=1e-6)
     assert bench.node._tracking.tally.without_pose == 2
     assert "tf2_ros cannot be imported" in capfd.readouterr().err
-
-
-def test_no_budget_is_endless():
-    assert RecoverParameters().recovery_options().time_budget == np.inf
-    assert RecoverParameters(time_budget=0.05).recovery_options().time_budget == 0.05

@@ -17,7 +17,7 @@ from frame_node_bench import CAMERA, FRAME_ID, Bench
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -190,10 +190,7 @@ def test_a_defect_costs_one_frame_and_not_the_node_and_no_bodies_are_an_answer(b
 
 def test_parameters_take_effect_with_the_next_frame(bench):
     bench.answer(bench.depth())
-    values = {"s": 3, "tau": 2.5, "depth_min": 0.2, "depth_max": 3, "max_objects": 4}
-    values["time_budget"] = 0.5
-    for result in bench.node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
-        assert result.successful, result.reason
+    bench.set(bench.node, s=3, tau=2.5, depth_min=0.2, depth_max=3, max_objects=4, time_budget=0.5)
     assert not bench.node.set_parameters([Parameter("s", value=-1.0)])[0].successful
     bench.answer(bench.depth())
     before, after = (asked[3] for asked in bench.recoverer.asked)
@@ -217,12 +214,6 @@ def test_enable_and_trigger(bench):
     assert first.result().message.startswith("1 body in 1 ms; 1 converged 200 x 200 x 200 mm")
     assert bench.send(bench.depth()).dropped == 2
 
-    refused = ask_for_next(bench, "trigger")
-    bench.send(with_fields(bench.depth(), data=[]))
-    bench.until(refused.done)
-    assert not refused.result().success
-    assert "data" in refused.result().message
-
     assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=True)).success
     assert len(bench.answer(bench.depth())[1]) == 1
 
@@ -240,11 +231,13 @@ def test_who_asks_once_gets_the_bodies_of_the_next_image(bench):
     assert (answer.frame_id, answer.stamp) == (message.header.frame_id, stamp_of(message))
     assert answer.summary.startswith("1 body in 1 ms")
 
-    refused = ask_for_next(bench, "recover")
+    refused = bench.ask(Trigger, "/recover_node/trigger"), bench.ask(Trigger, "/recover_node/recover")
+    bench.until(lambda: len(bench.node._triggers) == 2)
     bench.send(with_fields(bench.depth(), data=[]))
-    bench.until(refused.done)
-    with pytest.raises(MessageError, match="data"):
-        from_response(refused.result())
+    bench.until(lambda: all(future.done() for future in refused))
+    for future in refused:
+        with pytest.raises(MessageError, match="data"):
+            from_response(future.result())
 
 
 def test_a_trigger_without_a_frame_answers_in_time_and_nothing_else_waits(make_bench, monkeypatch):
@@ -325,10 +318,10 @@ def test_masks_of_the_same_stamp_are_used(bench):
     masks.publish(labels_to_message(labels[:10], image.header))
     assert "mask: expected the size of the depth image, 64 x 48, got 64 x 10" in bench.send(image).last_error
 
-    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
+    bench.set(bench.node, use_masks="always")
     assert "use_masks is always" in bench.send(bench.depth()).last_error
 
-    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
+    bench.set(bench.node, use_masks="never")
     image = bench.depth()
     masks.publish(labels_to_message(labels, image.header))
     bench.answer(image)
@@ -340,11 +333,11 @@ def test_a_mask_that_comes_while_the_node_is_busy_is_used(make_bench):
     bench = make_bench("-p", "patience:=0.0")
     bench.send_info()
     masks = mask_publisher(bench)
-    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
+    bench.set(bench.node, use_masks="never")
     bench.recoverer.gate.clear()
     bench.images.publish(bench.depth())
     bench.until(lambda: len(bench.recoverer.asked) == 1)
-    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
+    bench.set(bench.node, use_masks="always")
     image = bench.depth()
     bench.images.publish(image)
     bench.until(lambda: bench.node._input._ready is not None)
@@ -402,8 +395,7 @@ def test_a_latched_cloud_reaches_those_who_come_later(make_bench):
     bench = make_bench("-p", "qos_overrides./recover_node/superquadrics.publisher.durability:=transient_local")
     bench.send_info()
     bench.answer(bench.depth())
-    kept = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-    late = bench.hear(PointCloud2, "recover_node/superquadrics", kept)
+    late = bench.hear(PointCloud2, "recover_node/superquadrics", latched_qos())
     bench.until(lambda: late)
 
 
@@ -441,7 +433,7 @@ def test_lost_messages_are_counted_and_the_remedy_fits_the_subscription(make_ben
     if not asked:
         deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         bench.peer.create_publisher(Image, "depth/image", deaf)
-        bench.until(lambda: source._image.qos.reliability == QoSReliabilityPolicy.BEST_EFFORT)
+        bench.until(lambda: source._image._qos.reliability == QoSReliabilityPolicy.BEST_EFFORT)
     for listener, total, new in ((source._image, 3, 3), (source._image, 5, 2), (source._info, 1, 1)):
         listener._on_message_lost(SimpleNamespace(total_count=total, total_count_change=new))
     assert bench.counts.lost == {"/depth/image": 5, "/depth/camera_info": 1}
@@ -492,9 +484,8 @@ def test_a_reliability_that_was_asked_for_stays(make_bench, asked):
 
 def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
     bench = make_bench()
-    once = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
     bench.peer.destroy_publisher(bench.infos)
-    latched = bench.peer.create_publisher(CameraInfo, "depth/camera_info", once)
+    latched = bench.peer.create_publisher(CameraInfo, "depth/camera_info", latched_qos())
     latched.publish(bench.info())
     bench.until(lambda: len(bench.node._input._infos) == 1)
     assert len(bench.answer(bench.depth())[1]) == 1
@@ -525,8 +516,7 @@ def test_the_support_plane_reaches_those_who_come_late(bench):
     header = bench.answer(bench.depth())[0].header
     bench.recoverer.plane = None
     bench.answer(bench.depth())
-    latched = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-    heard = bench.hear(PoseStamped, "recover_node/support_plane", latched)
+    heard = bench.hear(PoseStamped, "recover_node/support_plane", latched_qos())
     bench.until(lambda: heard)
     assert heard[0].header == header
     np.testing.assert_allclose(plane_of(heard[0]), [0.0, -0.8, -0.6, 0.5], atol=1e-12)
@@ -534,10 +524,9 @@ def test_the_support_plane_reaches_those_who_come_late(bench):
 
 def test_the_support_plane_of_a_frame_is_there_before_its_bodies(bench):
     """Who plans on the bodies of a camera that has moved must not do so on the plane of the frame before."""
-    planes: list[Any] = []
     pairs: list[tuple[Any, Any]] = []
     bench.recoverer.plane = np.array([0.0, -0.8, -0.6, 0.5])
-    bench.peer.create_subscription(PoseStamped, "recover_node/support_plane", planes.append, latched_qos())
+    planes = bench.hear(PoseStamped, "recover_node/support_plane", latched_qos())
 
     def plan(message: PointCloud2) -> None:
         pairs.append((message.header, planes[-1].header if planes else None))

@@ -48,27 +48,6 @@ def test_of_a_node_that_cannot_be_made_nothing_is_left():
     assert Half.destroyed == ["recover_node"]
 
 
-def started_from_python(before: str, call: str) -> subprocess.CompletedProcess[str]:
-    code = f"import sys; {before}; from sq_perception.nodes import executables; sys.exit(executables.{call})"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False)
-
-
-@pytest.mark.parametrize("call", ["recover_node()", "grasp_node()", "recover_cameras(['front'])"])
-def test_without_rclpy_a_node_says_what_is_missing(call):
-    done = started_from_python("sys.modules['rclpy'] = None", call)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
-    assert "needs ROS 2 in Python: pip install 'sq_perception[ros]'" in done.stderr
-
-
-def test_an_rclpy_that_cannot_be_imported_leaves_one_traceback(tmp_path):
-    """As one of another Python, whose compiled part is not found."""
-    (tmp_path / "rclpy").mkdir()
-    (tmp_path / "rclpy" / "__init__.py").write_text("raise ImportError('no compiled part')")
-    done = started_from_python(f"sys.path[:0] = [{str(tmp_path)!r}]", "recover_node([])")
-    assert (done.returncode, done.stderr.count("Traceback")) == (1, 1), done.stderr
-    assert done.stderr.endswith("ImportError: no compiled part\n")
-
-
 HEAPS = """
 import ctypes, threading
 from sq_perception.nodes import process

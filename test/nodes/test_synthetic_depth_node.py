@@ -171,10 +171,9 @@ def test_a_node_replays_what_a_folder_holds(tmp_path):
 
 def test_a_sensor_that_cannot_measure_the_scene_is_refused_while_the_node_runs(tmp_path):
     np.savez(tmp_path / "0.npz", depth=np.full((8, 8), 0.5, np.float32), projection="orthographic")
-    bench = SpunNodes("-p", "scene:=replay", "-p", f"path:={tmp_path}")
-    node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
-    bench.spin([node])
-    with bench:
+    with SpunNodes("-p", "scene:=replay", "-p", f"path:={tmp_path}") as bench:
+        node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
+        bench.spin([node])
         (refused,) = node.set_parameters([Parameter("sensor", value="zed")])
         assert not refused.successful
         assert "sensor" in refused.reason
