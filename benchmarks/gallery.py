@@ -69,9 +69,9 @@ def measured(found: Sequence[MatchedThing], frame: FrameRecovery) -> str:
         if one.body is not None
     ]
     missed = ", ".join(name for name, body in bodies.items() if body is None)
+    wrong = len(frame.recovered) - len(errors)
     return (
-        f"{len(errors)} of {len(found)} objects found{f' (missed: {missed})' * bool(missed)}, "
-        f"{len(frame.recovered) - len(errors)} false positives. Mean IoU "
+        f"{f'Missed: {missed}. ' * bool(missed)}{f'{wrong} false positives. ' * bool(wrong)}Mean IoU "
         f"{100 * np.mean([one.iou for one in found]):.0f} %, mean edge error {np.mean(errors):+.1f} mm."
     )
 
@@ -101,7 +101,7 @@ ENTRIES = {
     "household_stereo": Entry(
         "Stereo",
         kitchen(),
-        "Six objects that occlude each other. Stereo widens near objects by some pixels.",
+        "Six objects that occlude each other; stereo widens near ones by some pixels.",
         distance=0.85,
     ),
     "household_structured_light": Entry(
@@ -147,12 +147,11 @@ ENTRIES = {
 }
 
 INTRODUCTION = """
-Simulated [sensors](sensors.md), own masks, default options; one run of `python benchmarks/gallery.py` ({facts}).
+Simulated [sensors](sensors.md), own masks, default options: `python benchmarks/gallery.py` ({facts}).
 [Figures over many scenes](../README.md#accuracy-and-speed).
 
-Left: depth image, near is light, black has no reading. Middle: masks and recovered outlines, hidden edges faint.
-Right: recovered bodies, true objects as thin lines. Edges are full lengths ± one sigma; IoU is with the true convex
-hull.
+Left: depth, near is light, black has no reading. Middle: masks and outlines. Right: bodies, true objects as thin lines.
+Edges are full lengths ± one sigma; IoU is with the true convex hull. Unless noted, every object is found and nothing else.
 """
 
 

@@ -88,8 +88,9 @@ class FiguresOfMerit:
         return cls(
             np.where(missing, 0.0, metrics.thesis_iou(prediction, truth)),
             np.where(missing, 0.0, metrics.volume_iou(prediction, truth)),
-            known(metrics.volume_error(prediction, truth)), known(metrics.shape_error(prediction, truth)),
-            known(metrics.translation_error(prediction, truth)),
+            known(prediction.size.prod(axis=-1) / truth.size.prod(axis=-1) - 1),
+            known(prediction.shape.sum(axis=-1) / truth.shape.sum(axis=-1) - 1),
+            known(prediction.translation - truth.translation),
             known(shortest_arc(prediction.rotation, truth.rotation)), known(angles[0, :4].min(axis=0)),
             known(angles[0].min(axis=0)), known(angles.min(axis=(0, 1))),
             np.full(count, np.nan) if milliseconds is None else np.asarray(milliseconds, dtype=float),

@@ -25,17 +25,13 @@ from sq_perception.geometry import kernel_cache
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
-_EXPONENT_BITS = 52
-_MANTISSA = np.int64(0x000F_FFFF_FFFF_FFFF)
-_BITS_OF_ONE = np.int64(0x3FF0_0000_0000_0000)
-_BITS_OF_2_TO_52 = np.int64(0x4330_0000_0000_0000)
+ROOT_OF_2 = math.sqrt(2.0)
 _BIAS = 2.0**52 + 1023.0
 """A number between 2^52 and 2^53 has its integer value in its lowest bits: adding this is a conversion."""
-_ROOT = math.sqrt(2.0)
-_A0, _A1, _A2, _A3, _A4, _A5, _A6, _A7, _A8 = (2 / math.log(2) / (2 * k + 1) for k in range(9))
-_E0, _E1, _E2, _E3, _E4, _E5, _E6, _E7, _E8, _E9, _E10, _E11, _E12 = (
-    math.log(2) ** k / math.factorial(k) for k in range(13)
-)
+_LOG2 = tuple(2 / math.log(2) / (2 * k + 1) for k in range(9))
+"""Coefficients of (log2 m - 1/2) / s, by powers of s^2."""
+_EXP2 = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))
+"""Coefficients of 2^r, by powers of r."""
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "forceinline": True,
@@ -68,33 +64,36 @@ _number = _bitcast(types.int64, types.float64)
 @_elementary
 def log2_from_1_to_2(m: float) -> float:
     """The logarithm to base 2 of 1 <= m <= 2."""
-    s = (m - _ROOT) / (m + _ROOT)
+    a = _LOG2
+    s = (m - ROOT_OF_2) / (m + ROOT_OF_2)
     q = s * s
     q2 = q * q
     q4 = q2 * q2
-    even = (_A0 + _A1 * q) + (_A2 + _A3 * q) * q2
-    return 0.5 + s * (even + ((_A4 + _A5 * q) + (_A6 + _A7 * q) * q2 + _A8 * q4) * q4)
+    even = (a[0] + a[1] * q) + (a[2] + a[3] * q) * q2
+    return 0.5 + s * (even + ((a[4] + a[5] * q) + (a[6] + a[7] * q) * q2 + a[8] * q4) * q4)
 
 
 @_elementary
 def log2(x: float) -> float:
     """The logarithm to base 2 of a positive normal number."""
     bits = _bits(x)
-    exponent = _number((bits >> _EXPONENT_BITS) | _BITS_OF_2_TO_52) - _BIAS
-    return exponent + log2_from_1_to_2(_number((bits & _MANTISSA) | _BITS_OF_ONE))
+    # The exponent as the low bits of a number from 2^52; the other bits with the exponent of a number from 1 to 2.
+    exponent = _number((bits >> 52) | 0x4330_0000_0000_0000) - _BIAS
+    return exponent + log2_from_1_to_2(_number((bits & 0x000F_FFFF_FFFF_FFFF) | 0x3FF0_0000_0000_0000))
 
 
 @_elementary
 def exp2_to_half(r: float) -> float:
     """2^r for |r| <= 1/2."""
+    a = _EXP2
     r2 = r * r
     r4 = r2 * r2
-    low = ((_E0 + _E1 * r) + (_E2 + _E3 * r) * r2) + ((_E4 + _E5 * r) + (_E6 + _E7 * r) * r2) * r4
-    return low + ((_E8 + _E9 * r) + (_E10 + _E11 * r) * r2 + _E12 * r4) * (r4 * r4)
+    low = ((a[0] + a[1] * r) + (a[2] + a[3] * r) * r2) + ((a[4] + a[5] * r) + (a[6] + a[7] * r) * r2) * r4
+    return low + ((a[8] + a[9] * r) + (a[10] + a[11] * r) * r2 + a[12] * r4) * (r4 * r4)
 
 
 @_elementary
 def exp2(x: float) -> float:
     """2^x for -1022 <= x <= 1023."""
     n = np.floor(x + 0.5)
-    return exp2_to_half(x - n) * _number(_bits(n + _BIAS) << _EXPONENT_BITS)
+    return exp2_to_half(x - n) * _number(_bits(n + _BIAS) << 52)

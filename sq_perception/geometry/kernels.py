@@ -27,7 +27,7 @@ import numpy as np
 
 from sq_perception.geometry import kernel_cache
 from sq_perception.geometry.body_numbers import LEAST_CONJUGATE
-from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_from_1_to_2
+from sq_perception.geometry.elementary import ROOT_OF_2, exp2, exp2_to_half, log2, log2_from_1_to_2
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 Triple: TypeAlias = tuple[float, float, float]
@@ -115,19 +115,9 @@ RAY_TOLERANCE, MAX_NEWTON_STEPS = 1e-9, 60
 """Tolerance of a ray's entry, as a share of its way through the bounding box, and of the gauge there; most steps."""
 _SINES = tuple(math.sin(math.pi * k / 6) for k in range(-3, 4))
 """Points of a tapered body's profile from which its support is sought, from pole to pole."""
-_SUPPORT_STEPS = 12
-"""Most steps of that search; mostly 4 do."""
 _SUPPORT_TOLERANCE = 1e-7
-"""Error of the sine at which it ends: the support is off by its square."""
-_STRIDES = 12
-"""Even steps through a tapered body's frustum in which a ray's first intersection is bracketed."""
-_NEGLIGIBLE_LOG2 = -115.0
-"""A power below 2^this adds nothing to 1."""
-_TINIEST, _TINY = 1e-290, 1e-145
-_FLAT = 1e-12
-"""Below this share of the larger coordinate, the slope by the smaller one fades to 0, its value on the axis."""
-_ROOT_OF_2 = math.sqrt(2.0)
-_HALF_LN_2 = 0.5 * math.log(2.0)
+"""Error of the sine at which that search ends: the support is off by its square."""
+_TINY = 1e-145
 
 
 @inline_kernel
@@ -136,17 +126,19 @@ def p_norm(u: float, v: float, e: float) -> tuple[float, float, float, float]:
 
     With the larger of u and v in front, the norm is big (1 + p)^(e/2), p = (small / big)^(2/e).  The derivatives by u
     and v are norm s / u and norm (1 - s) / v, s = u^(2/e) / (u^(2/e) + v^(2/e)) the share of u; d/de is the norm times
-    the entropy of the two shares, halved.  No branch: a loop over points becomes vector code.
+    the entropy of the two shares, halved.  Where the smaller is below 1e-12 of the larger, the slope by it fades to 0,
+    its value on the axis.  No branch: a loop over points becomes vector code.
     """
     big, small = max(u, v), min(u, v)
-    log_power = max((2.0 / e) * log2(max(small, _TINIEST) / max(big, _TINY)), _NEGLIGIBLE_LOG2)
+    # A power below 2^-115 adds nothing to 1.
+    log_power = max((2.0 / e) * log2(max(small, _TINY * _TINY) / max(big, _TINY)), -115.0)
     power = exp2(log_power)
     log_sum = log2_from_1_to_2(1.0 + power)
-    norm = big * (_ROOT_OF_2 * exp2_to_half(0.5 * e * log_sum - 0.5))
+    norm = big * (ROOT_OF_2 * exp2_to_half(0.5 * e * log_sum - 0.5))
     share = power / (1.0 + power)
     of_big = (1.0 - share) * norm / max(big, _TINY)
-    of_small = share * norm / max(small, _FLAT * big + _TINY)
-    of_e = _HALF_LN_2 * norm * (log_sum - share * log_power)
+    of_small = share * norm / max(small, 1e-12 * big + _TINY)
+    of_e = 0.5 * math.log(2.0) * norm * (log_sum - share * log_power)
     return norm, (of_big if u >= v else of_small), (of_small if u >= v else of_big), of_e
 
 
@@ -206,12 +198,12 @@ def conjugate(e: float) -> float:
 
 
 @inline_kernel
-def _by_sine(s: float, nx: float, ny: float, nz: float, form: Form) -> tuple[float, float, float]:
+def _by_sine(s: float, nx: float, ny: float, nz: float, form: Form) -> tuple[float, float, float, float]:
     """A tapered body's support by the point of its profile whose normal has the sine ``s``.
 
     The section at z = t a3 has the support sigma(t) S(t), where (t, sigma) runs on the profile, a unit ball, and S is
-    the dual norm of (a1 f1 n_x, a2 f2 n_y).  Returned are n_z a3 t + sigma S, and A and S: at the maximum the normal of
-    the profile is along (A, S), A = n_z a3 + sigma S'.
+    the dual norm of (a1 f1 n_x, a2 f2 n_y).  Returned are n_z a3 t + sigma S, t, and A and S: at the maximum the normal
+    of the profile is along (A, S), A = n_z a3 + sigma S'.
     """
     a1, a2, a3, e1, e2, k1, k2 = form
     _, sigma, t, _ = p_norm(math.sqrt(max(1.0 - s * s, 0.0)), abs(s), conjugate(e1))
@@ -219,7 +211,7 @@ def _by_sine(s: float, nx: float, ny: float, nz: float, form: Form) -> tuple[flo
     u, v = a1 * abs(nx), a2 * abs(ny)
     across, by_u, by_v, _ = p_norm(u * (1.0 + k1 * t), v * (1.0 + k2 * t), conjugate(e2))
     along = nz * a3 + sigma * (by_u * u * k1 + by_v * v * k2)
-    return nz * a3 * t + sigma * across, along, across
+    return nz * a3 * t + sigma * across, t, along, across
 
 
 @kernel
@@ -235,16 +227,16 @@ def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
     for k in range(len(_SINES)):
         at, left, right = _SINES[k], _SINES[max(k - 1, 0)], _SINES[min(k + 1, len(_SINES) - 1)]
         for i in range(count):
-            value, _, _ = _by_sine(at, nx[i], ny[i], nz[i], form)
+            value, _, _, _ = _by_sine(at, nx[i], ny[i], nz[i], form)
             above = value > best[i]
             best[i] = value if above else best[i]
             s[i] = at if above else s[i]
             low[i], high[i] = left if above else low[i], right if above else high[i]
-    for step in range(_SUPPORT_STEPS):
+    for step in range(12):  # mostly 4 do
         farthest = 0.0
         for i in range(count):
             at = s[i]
-            _, along, across = _by_sine(at, nx[i], ny[i], nz[i], form)
+            _, _, along, across = _by_sine(at, nx[i], ny[i], nz[i], form)
             sine = along / max(math.sqrt(along * along + across * across), _TINY)
             excess = at - sine
             left, right = low[i] if excess > 0.0 else at, at if excess > 0.0 else high[i]
@@ -284,12 +276,9 @@ def support_at(
 ) -> Support:
     """:func:`support_derivatives` where the sine of :func:`profile_sines` is known; without a taper any will do."""
     u, v = a1 * abs(nx), a2 * abs(ny)
-    is_tapered = k1 != 0.0 or k2 != 0.0
-    t = 0.0
-    if is_tapered:
-        _, _, t, _ = p_norm(math.sqrt(max(1.0 - s * s, 0.0)), abs(s), conjugate(e1))
-        t = math.copysign(t, s)
-    along = _by_sine(s, nx, ny, nz, (a1, a2, a3, e1, e2, k1, k2))[1] if is_tapered else nz * a3
+    t, along = 0.0, nz * a3
+    if k1 != 0.0 or k2 != 0.0:
+        _, t, along, _ = _by_sine(s, nx, ny, nz, (a1, a2, a3, e1, e2, k1, k2))
     f1, f2 = 1.0 + k1 * t, 1.0 + k2 * t
     inner, inner_u, inner_v, inner_e = p_norm(f1 * u, f2 * v, conjugate(e2))
     h, h_inner, h_z, h_e = p_norm(inner, abs(along), conjugate(e1))
@@ -373,8 +362,6 @@ def inside_box(origin: Triple, way: Triple, form: Form) -> tuple[float, float]:
 def ray_entry(origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
     """First intersection of the ray with the surface, over all t: (hit, t)."""
     t_in, t_out = inside_box(origin, way, form)
-    if t_in > t_out:
-        return False, 0.0
     return _first(t_in, t_out, origin, way, form)
 
 
@@ -382,20 +369,18 @@ def ray_entry(origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
 def ray_interval(origin: Triple, way: Triple, form: Form) -> tuple[bool, float, float]:
     """First and last intersection of the ray with the surface: (hit, t_first, t_last)."""
     t_in, t_out = inside_box(origin, way, form)
-    if t_in > t_out:
-        return False, 0.0, 0.0
     hit, first = _first(t_in, t_out, origin, way, form)
     if not hit:
         return False, 0.0, 0.0
     dx, dy, dz = way
     hit, last = _first(-t_out, -t_in, origin, (-dx, -dy, -dz), form)
-    if not hit:
-        return False, 0.0, 0.0
-    return True, first, -last
+    return hit, first, -last
 
 
 @kernel
 def _first(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
+    if t_in > t_out:
+        return False, 0.0
     if form[5] == 0.0 and form[6] == 0.0:
         return _newton(t_in, t_out, origin, way, form)
     return _intersect_tapered(t_in, t_out, origin, way, form)
@@ -409,8 +394,9 @@ def _intersect_tapered(t_in: float, t_out: float, origin: Triple, way: Triple, f
     g, slope = gauge_slope(ox + t_in * dx, oy + t_in * dy, oz + t_in * dz, dx, dy, dz, form)
     if g <= 1.0 + RAY_TOLERANCE:
         return True, t_in
-    stride, low = (t_out - t_in) / _STRIDES, t_in
-    for k in range(_STRIDES):
+    strides = 12
+    stride, low = (t_out - t_in) / strides, t_in
+    for k in range(strides):
         high = t_in + (k + 1) * stride
         g_high, s_high = gauge_slope(ox + high * dx, oy + high * dy, oz + high * dz, dx, dy, dz, form)
         right, inner = high, g_high
@@ -428,7 +414,7 @@ def _intersect_tapered(t_in: float, t_out: float, origin: Triple, way: Triple, f
                     break
         if inner <= 1.0:
             return True, _crossing(low, right, origin, way, form)
-        low, g, slope = high, g_high, s_high
+        low, slope = high, s_high
     return False, 0.0
 
 

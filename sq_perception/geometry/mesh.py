@@ -47,7 +47,6 @@ FORMATS = ("glb", "ply", "stl", "obj")
 """Suffixes of the files that :func:`export` writes."""
 
 
-
 def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:
     """Return the closed triangle mesh of one body as arrays.
 
@@ -115,27 +114,16 @@ def export(
     bodies: Superquadric | Sequence[Superquadric], path: str | Path, *, resolution: int = 64,
     colours: np.ndarray | None = None, names: Sequence[str] | None = None, optical: bool = True,
 ) -> Path:
-    """Write bodies as a coloured scene.
+    """Write bodies, one, a batch (n,) or a sequence of single ones, as a coloured scene.
 
-    Parameters
-    ----------
-    bodies : Superquadric
-        One, a batch (n,) or a sequence of single bodies.
-    path : str or Path
-        Its suffix is one of :data:`FORMATS`: GLB and OBJ have a named object per body, PLY and STL one mesh, STL
-        without colours.
-    colours : (n, 3), optional
-        Red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.
-    names : (n,), optional
-        Names of the nodes of a GLB; body_0, body_1 ... if not given.
-    optical : bool
-        The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x
-        so that viewers show them upright.  The others always keep the coordinates.
+    ``path``: its suffix is one of :data:`FORMATS`: GLB and OBJ have a named object per body, PLY and STL one mesh, STL
+    without colours.  ``colours`` (n, 3): red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.  ``names``
+    (n,): of the nodes of a GLB; body_0, body_1 ... if not given.  ``optical``: the bodies are in the optical frame (y
+    down): a GLB, whose y axis is up by its standard, is turned half about x so that viewers show them upright.  The
+    others always keep the coordinates.
 
-    Raises
-    ------
-    ValueError
-        For another suffix, where there is no body to write, not one name a body, or colours of another form.
+    Raises ValueError for another suffix, where there is no body to write, not one name a body, or colours of another
+    form.
     """
     import trimesh
 

@@ -1,4 +1,4 @@
-"""How close two superquadrics are: volume IoU and the thesis' relative errors (chapter 5.4).
+"""How close two superquadrics are: volume IoU.
 
 IoU counts grid points inside either and both bodies (equation 5.1).  Bodies are convex (e <= 2), so a grid column meets
 each in one interval, and points are counted per column from the interval's ends: exact for the grid, at the cost of a
@@ -31,21 +31,6 @@ def volume_iou(prediction: Superquadric, truth: Superquadric, resolution: int = 
     truth_lower, truth_upper = (np.reshape(corner, (-1, 3)) for corner in truth.bounding_box())
     _batch(prediction, truth)
     return _iou(prediction, truth, np.minimum(lower, truth_lower), np.maximum(upper, truth_upper), resolution)
-
-
-def volume_error(prediction: Superquadric, truth: Superquadric) -> np.ndarray:
-    """Compute Delta A of each body: relative error of a1 a2 a3 (equation 5.2 is its mean)."""
-    return np.prod(prediction.size, axis=-1) / np.prod(truth.size, axis=-1) - 1
-
-
-def shape_error(prediction: Superquadric, truth: Superquadric) -> np.ndarray:
-    """Compute Delta E of each body: relative error of e1 + e2 (equation 5.3 is its mean)."""
-    return np.sum(prediction.shape, axis=-1) / np.sum(truth.shape, axis=-1) - 1
-
-
-def translation_error(prediction: Superquadric, truth: Superquadric) -> np.ndarray:
-    """Compute Delta T of each body (..., 3) in its unit; the thesis gives the mean in % of the cube (5.4)."""
-    return prediction.translation - truth.translation
 
 
 def _batch(prediction: Superquadric, truth: Superquadric) -> int:

@@ -37,28 +37,13 @@ _OF_COVARIANCE = 11
 def signed_distance(
     body: Any, points: np.ndarray, covariance: np.ndarray | None = None, k_sigma: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a lower bound of the signed distance of points to bodies, and its gradient.
+    """Return a lower bound (n,) of the signed distance of points to the nearest body, metres, negative inside.
 
-    Parameters
-    ----------
-    body : Superquadric
-        One, or a batch (k,); NumPy.
-    points : (n, 3)
-        In the parent frame, metres.
-    covariance : (11, 11) or (k, 11, 11), optional
-        That of :class:`sq_perception.fitting.fit.Fit`; needed for ``k_sigma``.
-    k_sigma
-        Standard deviations of the distance that are taken off, 0 or more.
+    And its gradient (n, 3), unit vectors.  ``body``: Superquadric, one or a batch (k,), NumPy.  ``points`` (n, 3): in
+    the parent frame, metres.  ``covariance`` (11, 11) or (k, 11, 11): that of :class:`sq_perception.fitting.fit.Fit`,
+    needed for ``k_sigma``, the standard deviations of the distance that are taken off, 0 or more.
 
-    Returns
-    -------
-    distance, gradient : (n,), (n, 3)
-        Of the nearest of the bodies; metres, negative inside, and unit vectors.
-
-    Raises
-    ------
-    ValueError
-        If the arguments have the wrong form, or deviations are asked for that are not known.
+    Raises ValueError if the arguments have the wrong form, or deviations are asked for that are not known.
     """
     points = np.ascontiguousarray(points, dtype=float)
     if points.ndim != 2 or points.shape[1] != 3:

@@ -49,8 +49,9 @@ from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, check_
 Array = Any
 """A NumPy array or a torch tensor."""
 
-FLAT_LENGTH, NUMBERS = 12, 14
-"""Numbers of a body without and with its taper."""
+NUMBERS = sum(LENGTHS.values())
+FLAT_LENGTH = NUMBERS - LENGTHS["taper"]
+"""Numbers of a body with and without its taper."""
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
 _ENDS = np.array([1.0, -1.0, -1.0, 1.0])
@@ -144,10 +145,7 @@ class Superquadric:
     def to_flat(self) -> Array:
         """Return flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw.
 
-        Raises
-        ------
-        ValueError
-            For bodies that taper, as this order has no place for it.
+        Raises ValueError for bodies that taper, as this order has no place for it.
         """
         if self.is_tapered:
             raise ValueError("expected bodies without a taper; `to_numbers` has a place for it")
@@ -226,12 +224,14 @@ class Superquadric:
 
     def gauge(self, points: Array) -> Array:
         """Return g at points (..., N, 3) of the parent frame, shape (..., N); 1 on the surface."""
-        p = self.to_object(points)
-        xp = array_namespace(p)
-        q = xp.abs(p) / self.size[..., None, :]
-        scale = self._section(p)
-        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        return nested_norm(q[..., 0] / scale[..., 0], q[..., 1] / scale[..., 1], q[..., 2], e1, e2)
+        return nested_norm(*self._in_units(self.to_object(points))[1])
+
+    def _in_units(self, points: Array) -> tuple[Array, tuple[Array, ...]]:
+        """Return the scale of the sections at points of the object's frame, and the arguments of the nested norm."""
+        xp = array_namespace(points)
+        x, y, z = (xp.abs(points[..., k]) / self.size[..., None, k] for k in range(3))
+        scale = self._section(points)
+        return scale, (x / scale[..., 0], y / scale[..., 1], z, self.shape[..., None, 0], self.shape[..., None, 1])
 
     def _section(self, points: Array) -> Array:
         """Return the scale (..., N, 2) of the sections at points (..., N, 3) of the object's frame."""
@@ -286,10 +286,8 @@ class Superquadric:
     def _gauge_and_gradient(self, points: Array) -> tuple[Array, Array]:
         p = self.to_object(points)
         xp = array_namespace(p)
-        q = xp.abs(p) / self.size[..., None, :]
-        scale = self._section(p)
-        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        gauge, slopes = nested_norm_and_slopes(q[..., 0] / scale[..., 0], q[..., 1] / scale[..., 1], q[..., 2], e1, e2)
+        scale, arguments = self._in_units(p)
+        gauge, slopes = nested_norm_and_slopes(*arguments)
         gradient = xp.stack(slopes, axis=-1) * xp.sign(p) / self.size[..., None, :]
         across = gradient[..., :2] / scale
         taper = self.taper[..., None, :]
@@ -411,23 +409,13 @@ class Superquadric:
         Where a1 = a2 no quarter turn is tried, and of two forms of equal angles either may come out: such bodies have
         several representatives.
         """
-        size, q, taper = self.size, self.rotation, self.taper
-        if not self.batch_shape:  # numbers of a single body: a fourth of the time
-            if size[0] < size[1]:
-                size, q, taper = size[[1, 0, 2]], quaternions.multiply(q, _QUARTER_TURN), taper[::-1]
-            x, y, z, w = (round(abs(part), 12) for part in q.tolist())
-            parts = w, x, y, z
-            half = parts.index(max(parts))
-            q = quaternions.multiply(q, _HALF_TURNS[half])
-            taper = taper * _ENDS[half] + 0.0  # no -0
-            return Superquadric(size, self.shape, self.translation, -q if q[3] < 0 else q, taper)
-        swapped = size[..., :1] < size[..., 1:2]
-        size = np.where(swapped, size[..., [1, 0, 2]], size)
-        q = quaternions.multiply(q, np.where(swapped, _QUARTER_TURN, _HALF_TURNS[0]))
+        swapped = self.size[..., :1] < self.size[..., 1:2]
+        size = np.where(swapped, self.size[..., [1, 0, 2]], self.size)
+        q = quaternions.multiply(self.rotation, np.where(swapped, _QUARTER_TURN, _HALF_TURNS[0]))
         largest = np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1)
         q = quaternions.multiply(q, _HALF_TURNS[largest])
         q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
-        taper = np.where(swapped, taper[..., ::-1], taper) * _ENDS[largest][..., None] + 0.0
+        taper = np.where(swapped, self.taper[..., ::-1], self.taper) * _ENDS[largest][..., None] + 0.0  # no -0
         return Superquadric(size, self.shape, self.translation, q, taper)
 
 
@@ -444,8 +432,7 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
     taper: (..., 1, 2).
     """
     least = 1e-12  # least sine and cosine of a point on a profile: the derivatives of their powers stay finite
-    # Points of a tapered body's profile from which its support is sought, golden sections of that, and their ratio.
-    scan, sections, golden = 25, 45, 0.618033988749895
+    scan, golden = 25, (math.sqrt(5) - 1) / 2
     xp = array_namespace(q)
     e1, e2 = 2 - conjugate[..., 0], conjugate[..., 1]
 
@@ -461,7 +448,7 @@ def support_of_sections(q: Array, along: Array, conjugate: Array, taper: Array) 
     values = xp.stack([at(k * step - math.pi / 2 + still) for k in range(scan)], axis=-1)
     low = (xp.argmax(values, axis=-1) - 1) * step - math.pi / 2 + still
     high = low + 2 * step
-    for _ in range(sections):
+    for _ in range(45):
         left, right = high - golden * (high - low), low + golden * (high - low)
         falls = at(left) > at(right)
         low, high = xp.where(falls, low, left), xp.where(falls, right, high)

@@ -105,7 +105,7 @@ class Calibration:
         return depth if self.rectification is None else self.rectification.there.depth(depth)
 
     def rectify_labels(self, labels: np.ndarray) -> np.ndarray:
-        """The label image of ``camera`` from one of the depth image as it was sent; raises as :meth:`rectified`."""
+        """The label image of ``camera`` from one of the depth image as it was sent; raises as :meth:`rectify`."""
         self.check(labels)
         return labels if self.rectification is None else self.rectification.there.labels(labels)
 
@@ -153,12 +153,8 @@ def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion | None:
 
 def _note(info: Any, raw: bool) -> str:
     coefficients = " ".join([str(info.distortion_model), *(f"{value:g}" for value in info.d)])
-    if raw:
-        return (
-            f"the distortion ({coefficients}) is undone, as the name of the images does not say that they are "
-            "rectified; distortion = ignore takes them for rectified"
-        )
+    done, says, other = ("is", "does not say", "ignore") if raw else ("is not", "says", "apply")
     return (
-        f"the distortion ({coefficients}) is not undone, as the name of the images says that they are rectified; "
-        "distortion = apply takes them for raw"
+        f"the distortion ({coefficients}) {done} undone, as the name of the images {says} that they are rectified; "
+        f"distortion = {other} takes them for {'rectified' if raw else 'raw'}"
     )

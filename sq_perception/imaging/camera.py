@@ -44,11 +44,8 @@ class Lens(NamedTuple):
 class Camera:
     """Intrinsics of one image; see the module for the equations.
 
-    Raises
-    ------
-    ValueError
-        For a size that is no whole number of pixels or below one, a focal length that is not positive, or of a pinhole
-        camera up to one pixel, or anything not finite.
+    Raises ValueError for a size that is no whole number of pixels or below one, a focal length that is not positive, or
+    of a pinhole camera up to one pixel, or anything not finite.
     """
 
     width: int
@@ -142,10 +139,7 @@ class Camera:
     def readings(self, depth: np.ndarray) -> np.ndarray:
         """A depth image as a plain array, NaN where it is masked.
 
-        Raises
-        ------
-        ValueError
-            If it is no float image (height, width), such as one in millimetres, or has not this camera's size.
+        Raises ValueError unless it is a float image (height, width) of this camera's size: whole numbers are no metres.
         """
         image = np.asanyarray(depth)
         if image.ndim != 2 or image.dtype.kind != "f":

@@ -68,16 +68,12 @@ class CanonicalView:
 
     @property
     def hidden(self) -> np.ndarray:
-        """Background pixels (n, n) at which the object may go on unseen.
-
-        Something nearer stands there, or nothing was measured within the object's convex hull, or nothing was measured
-        at all; see :func:`from_mask`.  All False where this was not asked for.
-        """
+        """Background pixels (n, n) at which the object may go on unseen; all False where this was not asked for."""
         return ~(self.beside <= _NEARER)
 
     @property
     def marked(self) -> np.ndarray:
-        """The image with :data:`HIDDEN` at the hidden pixels, for networks that distinguish them from background."""
+        """The image with :data:`HIDDEN` at the hidden pixels."""
         return np.where(self.hidden, np.float32(HIDDEN), self.image)
 
     @property
@@ -236,10 +232,7 @@ def _with_surroundings(
 
 
 def _box(depth: np.ndarray, mask: np.ndarray, whole: bool) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the pixels of a mask that have a depth, or of the ``whole`` mask.
-
-    Widths of 0 where none has a depth.
-    """
+    """Box of the pixels of a mask that have a depth, or of the ``whole`` mask; of width 0 where none has one."""
     left, top, width, height = regions.box(np.ascontiguousarray(mask))
     window = np.s_[top : top + height, left : left + width]
     inner_left, inner_top, inner_width, inner_height = regions.box(mask[window] & np.isfinite(depth[window]))
@@ -258,10 +251,9 @@ def _within_hull(mask: np.ndarray) -> np.ndarray:
 def _rotate(
     depth: np.ndarray, mask: np.ndarray, unread: float, lens: Lens, matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere.
+    """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere; least, largest turned (x, y); least z.
 
-    And the least and the largest turned (x, y), and the least depth.  Other pixels of the mask are as deep as
-    ``unread``, and if that is not NaN their (x, y) are among those.
+    Unless ``unread`` is NaN, the (x, y) of other pixels of the mask, as deep as that, are among those.
     """
     image = np.full(depth.shape, np.float32(np.nan))
     low, high, closest = np.full(2, np.inf), np.full(2, -np.inf), np.inf
@@ -284,11 +276,10 @@ def _nearer(
     depth: np.ndarray, mask: np.ndarray, filled: np.ndarray, lost: np.ndarray, lens: Lens, matrix: np.ndarray,
     plane: np.ndarray, tolerance: float,
 ) -> np.ndarray:
-    """How much nearer than the object, metres, the reading at each pixel (height, width) beside it is.
+    """How much nearer than the object, metres, whose depth there is in ``filled``, each reading beside it is.
 
-    The object's own depth beside its mask is that of its nearest pixel, in ``filled``.  -inf at pixels of the object
-    and of the plane.  Where nothing was measured: +inf within the mask and NaN beyond it at the pixels set in ``lost``,
-    -inf at the others.
+    -inf at pixels of the object and of the plane.  Where nothing was measured: +inf within the mask and NaN beyond it
+    at the pixels set in ``lost``, -inf at the others.
     """
     nearer = np.full(depth.shape, np.float32(-np.inf))
     for v in range(depth.shape[0]):

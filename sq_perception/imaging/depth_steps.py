@@ -100,9 +100,7 @@ def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
     label = np.zeros((height, width), np.int32)
     rows, columns = np.empty(height * width, np.int32), np.empty(height * width, np.int32)  # still to look at
     largest, largest_size, pieces = 0, 0, 0
-    outside = np.zeros(height * width // 2 + 2, np.int32)
-    border = np.zeros(height * width // 2 + 2, np.int32)
-    sizes = np.zeros(height * width // 2 + 2, np.int32)
+    sizes, outside, border = np.zeros((3, height * width // 2 + 2), np.int32)
     for start_v in range(height):
         for start_u in range(width):
             if not inside[start_v, start_u] or label[start_v, start_u] > 0:

@@ -37,8 +37,8 @@ MILLIMETRES = 1000.0
 """Units a metre."""
 _STRAYS = 0.01
 """Share of the readings that may lie in between, as where an image was scaled down."""
-_NO_DISPARITY, _DISPARITIES = 2047, (300, 1090)
-"""Raw numbers of a Kinect: nothing measured; from half a metre to ten metres."""
+_NO_DISPARITY = 2047
+"""Raw number of a Kinect that measured nothing."""
 
 
 class UnitsError(ValueError):
@@ -172,7 +172,7 @@ def _refuse_disparities(numbers: np.ndarray) -> None:
     step = max(1, math.isqrt(numbers.size // 4000))
     v, u = np.nonzero((numbers[::step, ::step] > 0) & (numbers[::step, ::step] < _NO_DISPARITY))
     value = numbers[::step, ::step][v, u].astype(float)
-    low, high = _DISPARITIES
+    low, high = 300, 1090  # half a metre, ten metres
     if value.size < 100 or np.count_nonzero((value < low) | (value > high)) > _STRAYS * value.size:
         return
     pixels = np.stack([u, v, np.ones(u.size)], axis=1)

@@ -37,7 +37,6 @@ POLYNOMIAL = ("plumb_bob", "rational_polynomial")
 MODELS = (*POLYNOMIAL, FISHEYE)
 
 
-
 @dataclass(frozen=True)
 class Distortion:
     """One lens; see the module for the equations.
@@ -86,7 +85,7 @@ class Distortion:
         """Rays (..., 2) of images at (..., 2); NaN where no ray has its image."""
         exact = 1e-13  # tolerance of the place of an image: a ten-thousandth of a millionth of a pixel
         images = np.asarray(images, dtype=float)
-        if self.model != "equidistant" and not any(self.coefficients):
+        if self.model != FISHEYE and not any(self.coefficients):
             return images.copy()
         flat = images.reshape(-1, 2)
         table, reached = self._table

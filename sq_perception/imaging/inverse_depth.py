@@ -9,9 +9,6 @@ normal from them,
 and extrapolation along a plane is exact.  Where nothing is seen w = 0: infinitely far.
 
 A second eye, imager or projector, beside the camera at x = b sees a point of column u in its own column u - fx b w.
-
-Two neighbouring pixels show different surfaces (a jump) if one surface through both would be seen at more than 84
-degrees.
 """
 
 from __future__ import annotations
@@ -23,8 +20,8 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 
-_STEEPEST = 10.0
-"""Tangent of the incidence beyond which a step between neighbours is a jump."""
+STEEPEST = 10.0
+"""Tangent of the incidence, of 84 degrees, beyond which neighbouring pixels show two surfaces: a jump."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +105,7 @@ class InverseDepth:
         near_jump = cv2.dilate(beside(self.jumps()).view(np.uint8), brush).view(bool)
         nearest = cv2.dilate(self.w, brush)
         # More than a surface seen at 84 degrees rises within the brush: another surface.
-        covered = near_jump & ((nearest - self.w) * np.float32(self.camera.fx / _STEEPEST) > (pixels + 1) * self.w)
+        covered = near_jump & ((nearest - self.w) * np.float32(self.camera.fx / STEEPEST) > (pixels + 1) * self.w)
         grown = np.where(covered, nearest, self.w)
         flat = [np.where(covered, np.float32(0), slope) for slope in (self.slope_u, self.slope_v)]
         return InverseDepth(self.camera, grown, *flat), covered
@@ -126,7 +123,7 @@ def beside(jumps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
 
 
 def _apart(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
-    return np.abs(first - second) * np.float32(focal / _STEEPEST) > np.minimum(first, second)
+    return np.abs(first - second) * np.float32(focal / STEEPEST) > np.minimum(first, second)
 
 
 def _smaller_difference(w: np.ndarray, axis: int) -> np.ndarray:

@@ -22,22 +22,15 @@ RANGES = (
     "the support bends as if the image held distances to the camera's centre in place of z: --depth-kind range of "
     "commands, depth_kind of nodes"
 )
-_POINTS, _COUNTED, _DRAWS = 2500, 600, 150
-"""About so many readings are looked at, so many of them count for a drawn plane, and so many planes are drawn."""
 _TOLERANCE = 0.006
 """Of a plane, as a share of the distance."""
-_LEAST_VOLUME, _REFITS = 1e-4, 4
-"""Of three rays that a plane is drawn through, and how often it is fitted to the points on it."""
-_SHARE, _MORE = 0.25, 1.2
-"""Of the readings on the plane of ranges, and the ratio to those on the plane of z."""
 _LEVER = 0.01
 """Root mean square of log |r| on the plane, beside what a tilt explains."""
-_LEAST_K, _GREATEST_K = 0.75, 1.25
 
 
 def seem_ranges(depth: np.ndarray, camera: Camera) -> bool:
     """Whether an image (height, width), NaN where nothing was measured, seems to hold ranges."""
-    step = max(1, math.isqrt(depth.size // _POINTS))
+    step = max(1, math.isqrt(depth.size // 2500))  # about so many readings are looked at
     v, u = np.nonzero(np.isfinite(depth[::step, ::step]))
     if not camera.is_pinhole or v.size < 100:
         return False
@@ -49,7 +42,7 @@ def seem_ranges(depth: np.ndarray, camera: Camera) -> bool:
         return False
     as_z, as_range = _on_plane(rays, number), _on_plane(rays, number / length)
     count = np.count_nonzero(as_range)
-    if count < _SHARE * number.size or count < _MORE * np.count_nonzero(as_z):
+    if count < 0.25 * number.size or count < 1.2 * np.count_nonzero(as_z):
         return False
     # log v = k log |r| - log a.r, linearised at the plane of ranges: a shift of k against shifts of a.
     rays, number, bend, length = rays[as_range], number[as_range], bend[as_range], length[as_range]
@@ -58,37 +51,33 @@ def seem_ranges(depth: np.ndarray, camera: Camera) -> bool:
     across = bend - tilts @ np.linalg.lstsq(tilts, bend, rcond=None)[0]
     left = np.log(number * (rays @ plane) / length)
     k = 1 + across @ left / (across @ across)
-    return bool(np.sqrt(np.mean(across**2)) > _LEVER and _LEAST_K < k < _GREATEST_K)
+    return bool(np.sqrt(np.mean(across**2)) > _LEVER and 0.75 < k < 1.25)
 
 
 def _on_plane(rays: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Which of the points z * rays lie on the plane that has most of them."""
+    """Which of the points z * rays lie on the plane that has most of them, by 600 points for each of 150 planes."""
     rng = np.random.default_rng(0)
-    some = rng.permutation(z.size)[:_COUNTED]
-    return np.asarray(_search(rays, z, some, rng.integers(z.size, size=(_DRAWS, 3))))
+    some = rng.permutation(z.size)[:600]
+    return np.asarray(_search(rays, z, some, rng.integers(z.size, size=(150, 3))))
 
 
 @kernel
 def _search(rays: np.ndarray, z: np.ndarray, some: np.ndarray, drawn: np.ndarray) -> np.ndarray:
     """:func:`_on_plane` by planes a, a.r = 1/z, through three drawn points each, and the best one's least squares."""
-    plane, most = np.zeros(3), 0
-    for k in range(drawn.shape[0]):
-        i, j, m = drawn[k]
-        normals = np.empty((3, 3))
-        normals[0] = _cross(rays[j], rays[m])
-        normals[1] = _cross(rays[m], rays[i])
-        normals[2] = _cross(rays[i], rays[j])
-        volume = (rays[i] * normals[0]).sum()
-        if abs(volume) <= _LEAST_VOLUME:
+    plane, most, refits = np.zeros(3), 0, 4
+    for i, j, m in drawn:
+        across = _cross(rays[j], rays[m])
+        volume = (rays[i] * across).sum()
+        if abs(volume) <= 1e-4:
             continue
-        a = (normals[0] / z[i] + normals[1] / z[j] + normals[2] / z[m]) / volume
+        a = (across / z[i] + _cross(rays[m], rays[i]) / z[j] + _cross(rays[i], rays[j]) / z[m]) / volume
         count = 0
         for n in some:
             count += abs((a[0] * rays[n, 0] + a[1] * rays[n, 1] + a[2] * rays[n, 2]) * z[n] - 1.0) < _TOLERANCE
         if count > most:
             plane, most = a, count
     on = np.zeros(z.size, np.bool_)
-    for step in range(_REFITS + 1):
+    for step in range(refits + 1):
         square, right = np.zeros((3, 3)), np.zeros(3)
         for n in range(z.size):
             x, y, w = rays[n, 0] * z[n], rays[n, 1] * z[n], rays[n, 2] * z[n]
@@ -99,7 +88,7 @@ def _search(rays: np.ndarray, z: np.ndarray, some: np.ndarray, drawn: np.ndarray
                     right[k] += row[k]
                     for m in range(3):
                         square[k, m] += row[k] * row[m]
-        if step == _REFITS or np.count_nonzero(on) < 3:
+        if step == refits or np.count_nonzero(on) < 3:
             break
         plane[:] = np.linalg.solve(square, right)
     return on

@@ -1,7 +1,4 @@
-"""Exact depth images of superquadrics: rays against the gauge, Newton from the bounding box inwards.
-
-Depth is the z coordinate in the optical frame (metres), +inf where a pixel sees no body.
-"""
+"""Exact depth images of superquadrics: rays against the gauge, Newton from the bounding box inwards."""
 
 from __future__ import annotations
 
@@ -24,24 +21,11 @@ from sq_perception.imaging.camera import Camera, Lens
 def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Depth and visible body of every pixel.
 
-    Parameters
-    ----------
-    bodies : Superquadric
-        One body or a batch (n,) in the optical frame, NumPy.
-    camera : Camera
+    ``bodies``: one or a batch (n,) in the optical frame, NumPy; ValueError for a batch of more dimensions.
 
-    Returns
-    -------
-    depth : float64 (height, width)
-        Depth of the nearest surface in metres, +inf where there is none.  A pinhole camera sees only what is in front
-        of it; a camera inside a body does not see that body.
-    index : int32 (height, width)
-        Number of the visible body within the batch, -1 where there is none.
-
-    Raises
-    ------
-    ValueError
-        For a batch of more dimensions.
+    Returns depth, float64 (height, width), of the nearest surface, metres, +inf where there is none, and index, int32
+    (height, width), of the visible body within the batch, -1 where there is none.  A pinhole camera sees only what is
+    in front of it; a camera inside a body does not see that body.
     """
     if len(bodies.batch_shape) > 1:
         raise ValueError(f"bodies: expected one or a batch (n,), got a batch of shape {bodies.batch_shape}")

@@ -14,9 +14,8 @@ camera with another zoom, chosen for a window that must not change its size.
 
 Depth between pixels is interpolated in 1/z, in which planes are flat, where the four neighbours show one surface, and
 is nothing elsewhere: so no value lies between two surfaces, where nothing is, and none beside one.  The depth of the
-nearest pixel would be both measured and wrong: it puts points up to half a pixel outside of outlines, and as a ray that
-measured nothing contradicts nothing, bodies fitted to exact images came out up to 10 % too large, one of nine twice its
-length; now they are right to 0.6 %.  The price is a rim of half a pixel, and whatever is a single pixel wide.
+nearest pixel puts points up to half a pixel outside of outlines, and bodies fitted to exact images came out up to 10 %
+too large; so they are right to 0.6 %.  The price is a rim of half a pixel, and whatever is a single pixel wide.
 
 Neighbours show one surface if it would be seen at less than 84 degrees, a relative step of 10 / f, as in
 :mod:`sq_perception.imaging.inverse_depth`.  A smaller step may still be the edge of something flat; then a pixel is
@@ -39,11 +38,10 @@ from sq_perception.files.unpacking import MOST_PIXELS
 from sq_perception.imaging import depth_steps, hole_filling
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.inverse_depth import STEEPEST
 
 LARGEST_SIDE = 2**15 - 2
 """Largest side of an image that OpenCV can look up, pixels."""
-_STEEPEST = 10.0
-"""Tangent of the incidence beyond which a step between neighbours is a jump."""
 _OUTSIDE = -9.0
 """A column and row that no image has."""
 
@@ -91,14 +89,8 @@ class Rectification:
         return Lookup.of(_pixels(self.camera, self.distortion.inverse(images)), self.camera)
 
 
-@lru_cache(maxsize=16)
-# Calibrations whose tables are kept.
-def rectification(raw: Camera, distortion: Distortion) -> Rectification:
-    """The rectification of this calibration: equal calibrations share one, and its tables.
-
-    Raises ValueError as :class:`Rectification`.
-    """
-    return Rectification(raw, distortion)
+rectification = lru_cache(maxsize=16)(Rectification)
+"""The :class:`Rectification` of a calibration: equal ones share it, and its tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +115,7 @@ class Lookup:
         u, v = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
         left, top = np.floor(u), np.floor(v)
         off = np.maximum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v)))
-        step = math.sqrt(2.0) * _STEEPEST / min(source.fx, source.fy)
+        step = math.sqrt(2.0) * STEEPEST / min(source.fx, source.fy)
         # Distance of two places that are as good as one, pixels.
         return cls(source, u, v, left, top, (off <= 0.01).view(np.uint8), min(step, 0.5))
 

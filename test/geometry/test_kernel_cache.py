@@ -34,12 +34,8 @@ def test_kernels_are_compiled_in_one_place() -> None:
 def installation(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the package; skips where a folder cannot be made read-only for root too."""
     folder = tmp_path_factory.mktemp("installation")
-    if (
-        not shutil.which("unshare")
-        or subprocess.run(
-            ["unshare", "-rm", "sh", "-ec", READ_ONLY, str(folder), "true"], capture_output=True, check=False
-        ).returncode
-    ):
+    mount = ["unshare", "-rm", "sh", "-ec", READ_ONLY, str(folder), "true"]
+    if not shutil.which("unshare") or subprocess.run(mount, capture_output=True, check=False).returncode:
         pytest.skip("no mounts of one's own: unshare -rm is missing or not permitted")
     source = Path(sq_perception.__file__).parent
     shutil.copytree(source, folder / source.name, ignore=shutil.ignore_patterns("__pycache__"))
@@ -78,13 +74,8 @@ def test_a_command_that_has_to_compile_says_so_once(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     for times in (1, 0):
         done = subprocess.run(
-            [sys.executable, "-m", "sq_perception", *render],
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE,
-            check=True,
-            cwd=tmp_path,
+            [sys.executable, "-m", "sq_perception", *render], env=environment, capture_output=True, text=True,
+            timeout=PATIENCE, check=True, cwd=tmp_path,
         )
         assert done.stderr.count("compiling") == done.stderr.count("\n") == times
 
@@ -110,12 +101,8 @@ def test_a_named_place_goes_first(installation: Path, tmp_path: Path) -> None:
 def test_a_named_place_that_cannot_be_written_is_not_passed_over_in_silence(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     done = subprocess.run(
-        [sys.executable, "-m", "sq_perception", "doctor"],
+        [sys.executable, "-m", "sq_perception", "doctor"], capture_output=True, text=True, timeout=PATIENCE, check=True,
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file")},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-        check=True,
     )
     assert done.stderr.count("\n") == 1
     assert f"NUMBA_CACHE_DIR: {tmp_path / 'file'} cannot be written" in done.stderr

@@ -303,7 +303,7 @@ def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> Non
             [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120
         )
         answers.append(done.stdout.strip())
-        edited.write_text(edited.read_text().replace("return True, first, -last", "return True, first, first"))
+        edited.write_text(edited.read_text().replace("return hit, first, -last", "return hit, first, first"))
     assert answers == ["(2, 6)", "(2, 2)"]
 
 

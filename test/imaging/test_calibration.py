@@ -33,30 +33,27 @@ NO_K, NO_P = (0.0,) * 9, (0.0,) * 12
 
 
 @pytest.mark.parametrize(
-    ("name", "rectified"),
+    "name",
     [
-        ("/camera/camera/depth/image_rect_raw", True),
-        ("/camera/depth/image_rect", True),
-        ("/camera/depth/image_rect/compressedDepth", True),
-        ("/depth_registered/image_rect", True),
-        ("/camera/rect/image", True),
-        ("/camera/depth/rectified", True),
-        ("/camera/depth/Image_RECT", True),
-        ("recordings/depth-rect/0001", True),
-        ("/camera/depth/image_raw", False),
-        ("/camera/depth/image_raw/compressedDepth", False),
-        ("/camera/aligned_depth_to_color/image_raw", False),
-        ("/camera/depth_registered/image_raw", False),
-        ("/direct/image", False),
-        ("/rectangles/image", False),
-        ("/camera/unrectified/image", False),
-        ("/rect/camera/depth/image", False),
-        ("/depth/image", False),
-        ("", False),
+        *("/camera/camera/depth/image_rect_raw", "/camera/depth/image_rect", "recordings/depth-rect/0001"),
+        *("/depth_registered/image_rect", "/camera/rect/image", "/camera/depth/rectified", "/camera/depth/Image_RECT"),
+        "/camera/depth/image_rect/compressedDepth",
     ],
 )
-def test_names_that_say_rectified(name, rectified):
-    assert is_rectified_name(name) == rectified
+def test_names_that_say_rectified(name):
+    assert is_rectified_name(name)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("/camera/depth/image_raw", "/camera/depth/image_raw/compressedDepth", "/direct/image", "/depth/image", ""),
+        *("/camera/aligned_depth_to_color/image_raw", "/camera/depth_registered/image_raw", "/rectangles/image"),
+        *("/camera/unrectified/image", "/rect/camera/depth/image"),
+    ],
+)
+def test_names_that_do_not_say_rectified(name):
+    assert not is_rectified_name(name)
 
 
 @pytest.mark.parametrize(

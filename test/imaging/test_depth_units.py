@@ -27,22 +27,10 @@ HOLES[50:60, 70:78] = HOLES[90:100, 20:50] = HOLES[:, :4] = True
 @pytest.mark.parametrize(
     ("mark", "dtype", "scale"),
     [
-        (65535, np.uint16, 1000),
-        (65535, ">u2", 10000),
-        (32767, np.int16, 1000),
-        (65535, np.int32, 1000),
-        (2**31 - 1, np.int32, 1000),
-        (2047, np.uint16, 1000),
-        (4095, np.uint16, 1000),
-        (10_000, np.uint16, 1000),
-        (5000, np.uint16, 1000),
-        (255, np.uint8, 100),
-        (10.0, np.float32, 1),
-        (100.0, np.float64, 1),
-        (65.535, np.float32, 1),
-        (10.0, np.float16, 1),
-        (65504.0, np.float16, 1000),
-        (10_000.0, np.float32, 1000),
+        *((65535, np.uint16, 1000), (65535, ">u2", 10000), (32767, np.int16, 1000), (65535, np.int32, 1000)),
+        *((2**31 - 1, np.int32, 1000), (2047, np.uint16, 1000), (4095, np.uint16, 1000), (10_000, np.uint16, 1000)),
+        *((5000, np.uint16, 1000), (255, np.uint8, 100), (10.0, np.float32, 1), (100.0, np.float64, 1)),
+        *((65.535, np.float32, 1), (10.0, np.float16, 1), (65504.0, np.float16, 1000), (10_000.0, np.float32, 1000)),
     ],
 )
 def test_a_mark_of_nothing_measured_is_no_reading_and_is_named(table, mark, dtype, scale):
