@@ -62,22 +62,10 @@ from sq_perception.imaging.camera import Camera
 
 FRICTION = 0.5
 """Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
-_AT_MOST = 2.0
-"""Largest friction, as a multiple of the smallest."""
 PER_BODY = 8
 """Maximum number of grasps returned per body."""
 PLACEMENT = 0.002
 """Standard deviation of the hand's position along each axis, metres: a careful calibration of camera and arm."""
-_SQUARE = np.deg2rad(8.0)
-"""Standard deviation of normals, radians."""
-_HIDDEN = 0.15
-"""Probability that unseen space beside a body is occupied."""
-_CHECKED, _CHECKED_CLOSELY = 200, 16
-"""Number of grasps per body whose distance to other bodies is computed, and of the best whose distance to points is."""
-_SURE = 0.5
-"""Probability of a body's best grasp below which its rims are also tried."""
-_LEAST = 0.05
-"""Probability below which grasps are not returned."""
 
 
 class FittedObject(Protocol):
@@ -151,10 +139,11 @@ def grasps(
     trials = _trials(known, _loads(bodies, things, whole), closings, gripper, around, friction, placement)
     reasons[things[closings.owner]] = "no way for the fingers to come with the table and the palm in their way"
     reasons[np.setdiff1d(things, things[~_behind(known, around.plane)])] = "behind the plane that bodies stand on"
-    trials = _narrower(known, trials.first(_CHECKED), gripper, placement)
-    trials = _probable(trials, things, _CHECKED, reasons, "nothing holds")
+    checked = 200  # grasps per body whose distance to other bodies is computed
+    trials = _narrower(known, trials.first(checked), gripper, placement)
+    trials = _probable(trials, things, checked, reasons, "nothing holds")
     trials = _among_others(known, whole, trials, gripper, around, placement)
-    doubtful = np.flatnonzero(~np.isin(things, things[trials.owner[trials.total > np.log(_SURE)]]))
+    doubtful = np.flatnonzero(~np.isin(things, things[trials.owner[trials.total > np.log(0.5)]]))
     if len(doubtful):
         rims = at_rims(bodies, doubtful, gripper, around, friction, placement)
         trials = trials.join(_among_others(known, whole, rims, gripper, around, placement))
@@ -181,8 +170,11 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
 
 
 def _probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """Return each body's ``count`` best grasps; for things without any, the best one's weakest margin as the reason."""
-    found = trials.first(count, np.log(_LEAST))
+    """Return each body's ``count`` best grasps of a probability of 5 % and more.
+
+    Things without any get the best one's weakest margin as the reason.
+    """
+    found = trials.first(count, np.log(0.05))
     without = trials.at(~np.isin(things[trials.owner], things[found.owner]))
     without = without._replace(owner=things[without.owner]).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
@@ -203,8 +195,8 @@ def _trials(
     placement: float,
 ) -> Trials:
     """Return every closing from every side, at every depth and slide, with the margins of the body alone."""
-    narrow, broad = np.arctan([friction, _AT_MOST * friction])
-    cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
+    narrow, broad = np.arctan([friction, 2 * friction])
+    cone, doubt = 0.5 * (narrow + broad), np.hypot(np.deg2rad(8.0), (broad - narrow) / np.sqrt(12))  # and of normals
     every = approaches.from_every_side(bodies, found, gripper, around, placement)
     places = approaches.places(bodies, every, gripper, broad)
     ways, u, angle = every.at(places.of), places.ahead, places.angle
@@ -258,14 +250,15 @@ def _among_others(
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
     trials.logs[near, 6] = log_passing(gap[near], sigma, placement)
-    trials = trials.first(_CHECKED_CLOSELY)
+    trials = trials.first(16)  # whose distance to points is computed
     boxes = gripper.boxes_at(trials.opening)
     gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
     if around.camera is not None:
         _where_hidden(trials, gap, gripper, around, placement)
     doubt = log_phi(gap + PASSES, np.hypot(POINT_SIGMA, placement))
     trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
-    trials.logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
+    # Unseen space beside a body is occupied with a probability of 15 %.
+    trials.logs[:, 8] = np.log1p(-0.15 * around.unseen(trials.frames, boxes[:, :2]))
     return trials
 
 

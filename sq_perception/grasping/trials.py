@@ -27,10 +27,6 @@ NEARER = 0.4
 to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where
 they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
-_ACCELERATION = 9.81 + 2.0
-"""Acceleration of gravity and of the lift, m/s^2."""
-_PAD_RADIUS = 0.006
-"""Mean lever arm of the friction of a pad of some 18 mm, metres."""
 
 
 class Trials(NamedTuple):
@@ -84,10 +80,11 @@ def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
     return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
 
 
-def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = _PAD_RADIUS) -> np.ndarray:
+def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = 0.006) -> np.ndarray:
     """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line.
 
-    As a force, and as a torque that the friction holds by its mean ``arm``.
+    As a force, against gravity and a lift with 2 m/s^2, and as a torque that the friction holds by its mean ``arm``,
+    by default that of a pad of some 18 mm.
     """
-    load = np.maximum(1.0, lever / arm) * _ACCELERATION * mass / force
+    load = np.maximum(1.0, lever / arm) * (9.81 + 2.0) * mass / force
     return log_phi(1 / np.maximum(load, 1e-9) - 1, 0.5)

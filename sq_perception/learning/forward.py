@@ -27,9 +27,6 @@ from sq_perception.learning.network_config import (
     side_inputs,
 )
 
-_AT_ONCE = 40
-"""Views that pass through the layers together: 20 things, each seen twice."""
-
 
 class CompactRegressor:
     """:class:`sq_perception.learning.networks.Regressor` with a compact backbone, ready to predict."""
@@ -114,11 +111,10 @@ class _Network:
 
     def outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
         """Outputs (n, k), float32."""
+        at_once = 40  # views that pass through the layers together: 20 things, each seen twice
+        slices = [slice(first, first + at_once) for first in range(0, len(images), at_once)]
         with one_blas_thread():
-            parts = [
-                self._outputs(images[first : first + _AT_ONCE], more[first : first + _AT_ONCE])
-                for first in range(0, len(images), _AT_ONCE)
-            ]
+            parts = [self._outputs(images[part], more[part]) for part in slices]
         return np.concatenate(parts) if parts else np.empty((0, self._heads[0].shape[1]), np.float32)
 
     def _outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:

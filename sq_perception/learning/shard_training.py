@@ -13,9 +13,10 @@ The network of things
 ---------------------
 Half of the views are shown as in a mirror, of some the extent is kept back.
 
-    loss = mean over views of  -log p(h) / J  +  BODY |h_body - h|  +  CENTRE |mu - h|
+    loss = mean over views of  -log p(h) / J  +  2 |h_body - h|  +  |mu - h|
 
-The likelihood alone makes the first steps wild; the last term leads.  The log has the mean error of h by kind of thing,
+The likelihood is of order 1 where the other terms are of order 0.05, and alone makes the first steps wild; the last
+term leads.  The log has the mean error of h by kind of thing,
 and the standard deviation of error / sigma, which an honest network has at 1.
 
 The network of masks
@@ -55,8 +56,7 @@ from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.segment_views import UNKNOWN, YES, SegmentViews, draw_segment_views
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
-BODY, CENTRE, AROUND = 2.0, 1.0, 0.5
-"""Weights in the losses; the likelihood is of order 1 where those beside it are of order 0.05."""
+AROUND = 0.5
 _KEPT_BACK = 0.1
 """Share of the views without their extent, without the plane, and without other segments."""
 _AT_ONCE = 128
@@ -192,8 +192,8 @@ def hull_loss(
     """The loss for true support functions (b, J); see the module."""
     return (
         predicted.negative_log_likelihood(truth).mean() / truth.shape[1]
-        + BODY * body_loss(predicted.body, truth).mean()
-        + CENTRE * (predicted.support - truth).abs().mean()
+        + 2 * body_loss(predicted.body, truth).mean()
+        + (predicted.support - truth).abs().mean()
     )
 
 
@@ -212,11 +212,8 @@ def validate_things(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
         figures = error.abs().mean(dim=1), body_loss(predicted.body, truth), error / predicted.deviation()
         parts.append([each.cpu().numpy() for each in figures])
     mean_error, body_error, ratio = map(np.concatenate, zip(*parts, strict=True))
-    found: dict[str, Any] = {
-        "error": float(mean_error.mean()),
-        "body": float(body_error.mean()),
-        "ratio": float(ratio.std()),
-    }
+    means = {"error": mean_error.mean(), "body": body_error.mean(), "ratio": ratio.std()}
+    found: dict[str, Any] = {name: float(mean) for name, mean in means.items()}
     for k, kind in enumerate(KINDS):
         mine = views.kinds == k
         if mine.any():

@@ -35,8 +35,9 @@ yz has become xy, and the other two share one exponent:
     e2' = e1,    e1' = (e1 + e2) / 2,
 
 wrong by (e1 - e2) / 2 in each of them.  A box whose exponents differ by less than the noise is fitted now with one axis
-as z and now with another.  So an exchange is a candidate too where |e1 - e2| < EXCHANGE, with the variance (e1 - e2)^2
-added to both exponents.  The candidate of greatest likelihood is taken: least d^2 + log det S.
+as z and now with another.  So an exchange is a candidate too where |e1 - e2| < 1/2, with the variance (e1 - e2)^2
+added to both exponents: exponents of fitted boxes and ovals differ by less, those of cylinders by more.  The candidate
+of greatest likelihood is taken: least d^2 + log det S.
 """
 
 from __future__ import annotations
@@ -230,10 +231,6 @@ def same_side(before: np.ndarray, now: np.ndarray) -> bool:
     return bool(before @ now > 0.5 * np.linalg.norm(before) * np.linalg.norm(now))
 
 
-EXCHANGE = 0.5
-"""Chosen: the exponents of fitted boxes and ovals differ by less, those of cylinders by more."""
-
-
 def _rotations() -> np.ndarray:
     """The 24 rotation matrices with entries 0 and +-1, the 8 that leave z on its line first."""
     found = []
@@ -272,7 +269,7 @@ def nearest_form(
     """
     each = np.arange(len(track))
     unlike = np.abs(observed[:, 3] - observed[:, 4])
-    is_box = unlike < EXCHANGE
+    is_box = unlike < 0.5
     count = len(TURNS) if is_box.any() else EXACT
     forms = candidates(observed)[:, :count]
     changed = _CHANGES[:count] @ covariance[:, None] @ _CHANGES[:count].swapaxes(-1, -2)

@@ -36,8 +36,6 @@ from sq_perception.tracking.state import LENGTH, Observed
 from sq_perception.tracking.tracker import Track, Tracker
 
 FIRST_FAILED_ID = 2**31
-_LOOKS_IN = 0.2
-"""Cosine between a cavity's axis and the way to the camera from which on it is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +151,7 @@ class TrackingSession:
             return None
         known = self._cavities[number]
         known = replace(known, rim=place + turn @ known.rim, axis=turn @ known.axis)
-        if -(known.axis @ known.rim) > _LOOKS_IN * np.linalg.norm(known.rim):
+        if -(known.axis @ known.rim) > 0.2 * np.linalg.norm(known.rim):  # the camera looks into it
             del self._cavities[number]  # it was closed
             return None
         return known

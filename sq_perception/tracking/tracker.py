@@ -42,9 +42,6 @@ PREDICTED_SHARE = 0.6
 degrees about them, 90 instead of 84 % of the half sizes are within two deviations, of single frames 93 %."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
-UNKNOWN = 0.15, 0.2, 0.15, 0.2
-"""Deviations (sizes as shares, exponents, centre as a share of the mean half size, turn) of observations without
-covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
 FORGET_AFTER = 30.0
@@ -171,9 +168,9 @@ def _in_world(
             raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(body.covariance)}")
     flat = np.array([body.superquadric.untapered().to_flat() for body in recoveries], dtype=float).reshape(-1, 12)
     covariance = np.array([body.covariance for body in recoveries], dtype=float).reshape(-1, LENGTH, LENGTH)
-    size, shape, centre, turn = UNKNOWN
     for k in np.flatnonzero(~np.isfinite(covariance).all(axis=(1, 2))):
-        shares = state.diagonal(size, shape, centre * float(flat[k, 0:3].mean()), turn)
+        # Chosen: errors of the classic fit and of the network alone on household things are of this order.
+        shares = state.diagonal(0.15, 0.2, 0.15 * float(flat[k, 0:3].mean()), 0.2)
         covariance[k] = state.scale_sizes(shares, flat[k, 0:3])
     matrix = quaternions.to_matrix(rotation)
     flat[:, 5:8] = flat[:, 5:8] @ matrix.T + position

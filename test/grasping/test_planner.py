@@ -126,8 +126,7 @@ def test_what_lies_behind_the_support_has_that_for_a_reason():
     """Also where it is too wide; what looks out of the plane only in part is in the table's way."""
     sunk = Superquadric(*CAN, [0.5, 0.0, -0.055], UPRIGHT)
     behind, wide = (
-        Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT),
-        Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT),
+        Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT), Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT),
     )
     reasons = plan(behind, wide, sunk, standing(*CAN, y=0.5)).reasons
     assert reasons[:2] == ("behind the plane that bodies stand on",) * 2

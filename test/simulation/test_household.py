@@ -39,17 +39,13 @@ def test_the_support_function_is_that_of_points_of_the_hull(kind: str) -> None:
 def test_the_compiled_support_function_is_the_closed_form() -> None:
     rng = np.random.default_rng(0)
     parts = Superquadric(
-        rng.uniform(0.1, 2, (50, 3)),
-        rng.uniform(0.03, 1.9, (50, 2)),
-        rng.normal(size=(50, 3)),
+        rng.uniform(0.1, 2, (50, 3)), rng.uniform(0.03, 1.9, (50, 2)), rng.normal(size=(50, 3)),
         quaternions.random(50, rng),
     )
     closed = (parts.support(DIRECTIONS) + parts.translation @ DIRECTIONS.T).max(axis=0)
     np.testing.assert_allclose(support_of_union(parts, DIRECTIONS), closed, atol=1e-9)
     turn, shift = quaternions.random(1, rng)[0], rng.normal(size=3)
-    np.testing.assert_allclose(
-        move(parts.to_flat(), turn, shift), parts.transformed(turn, shift).to_flat(), atol=1e-12
-    )
+    np.testing.assert_allclose(move(parts.to_flat(), turn, shift), parts.transformed(turn, shift).to_flat(), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)

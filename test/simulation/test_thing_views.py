@@ -28,12 +28,8 @@ def alone(setting: Setting, camera: Camera | None = None) -> Setting:
 def finer(camera: Camera, times: int) -> Camera:
     """The same image with more pixels: centres are those of the pixels' middles."""
     return Camera(
-        camera.width * times,
-        camera.height * times,
-        camera.fx * times,
-        camera.fy * times,
-        (camera.cx + 0.5) * times - 0.5,
-        (camera.cy + 0.5) * times - 0.5,
+        camera.width * times, camera.height * times, camera.fx * times, camera.fy * times,
+        (camera.cx + 0.5) * times - 0.5, (camera.cy + 0.5) * times - 0.5,
     )
 
 
@@ -130,12 +126,8 @@ def test_a_mirrored_thing_has_the_mirrored_view() -> None:
         setting = alone(draw_setting(draw_thing(rng, [kind]), rng))
         camera = setting.camera
         other = Setting(
-            flipped(setting.parts),
-            flipped(setting.cavities) if len(setting.cavities) else NOTHING,
-            NOTHING,
-            None,
-            10.0,
-            Camera(camera.width, camera.height, camera.fx, camera.fy, camera.width - 1 - camera.cx, camera.cy),
+            flipped(setting.parts), flipped(setting.cavities) if len(setting.cavities) else NOTHING, NOTHING, None,
+            10.0, Camera(camera.width, camera.height, camera.fx, camera.fy, camera.width - 1 - camera.cx, camera.cy),
         )
         images, reaches = [], []
         for one in (setting, other):
