@@ -121,13 +121,6 @@ def test_no_wall_has_a_slit(kind: str) -> None:
     assert checked > 30
 
 
-def test_the_same_seed_draws_the_same_things() -> None:
-    first, second = ([draw_thing(np.random.default_rng(7)) for _ in range(3)] for _ in range(2))
-    for one, other in zip(first, second, strict=True):
-        assert one.kind == other.kind
-        np.testing.assert_array_equal(one.parts.to_flat(), other.parts.to_flat())
-
-
 def test_unknown_kinds_are_refused() -> None:
     rng = np.random.default_rng(0)
     for kinds in ([], ["elephant"]):
