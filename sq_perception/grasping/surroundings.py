@@ -85,7 +85,7 @@ class Surroundings:
         return np.where(length > 1e-6, places / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
 
     def unseen(self, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        """Return the share (k,) of some boxes (k, m, 6) at frames (k, 3, 4) that is 15 mm behind what the image shows."""
+        """Return the share (k,) of boxes (k, m, 6) at frames (k, 3, 4) that is 15 mm behind what the image shows."""
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
         local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]

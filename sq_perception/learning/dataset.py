@@ -146,14 +146,6 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 
-def turn_at_random(
-    images: np.ndarray, bodies: Superquadric, rng: np.random.Generator
-) -> tuple[np.ndarray, Superquadric]:
-    """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
-    turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
-    return move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
-
-
 class ViewPool:
     """A pool of rendered views from which batches are drawn, each time in another of the 8 positions.
 
@@ -178,8 +170,9 @@ class ViewPool:
         self._images[slots], self._flat[slots] = images, bodies.to_flat()
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
-        bodies = Superquadric.from_flat(self._flat[chosen])
-        views, bodies = turn_at_random(self._images[chosen], bodies, self._rng)
+        turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
+        views = move_images(self._images[chosen], turns, mirror)
+        bodies = move_bodies(Superquadric.from_flat(self._flat[chosen]), turns, mirror)
         return self._source.disturbance.apply(views, self._rng), bodies
 
 

@@ -42,8 +42,6 @@ from sq_perception.simulation.thing import (
     part,
 )
 
-KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
-
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
     """Draw a random object, of one of the given kinds or of any.
@@ -256,3 +254,4 @@ _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thin
     "soft": (0.04, ((_bag, 1.0),)),
 }
 """Default frequency of each kind, and its families with their frequencies."""
+KINDS = tuple(_MAKERS)

@@ -168,7 +168,7 @@ def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAME
             drawn = resting_body(rng, plane, 0.25)[0]
             if not inside_image(drawn, camera):
                 continue
-            body = _Placed.of(drawn, rng)
+            body = _Placed(drawn, drawn.sample_surface(1500, rng, oversampling=2))
             if bodies and rng.random() < 0.7:
                 body = _push(body, bodies[rng.integers(len(bodies))], plane[:3])
             if not any(map(body.overlaps, bodies)) and inside_image(body.body, camera):
@@ -184,10 +184,6 @@ class _Placed:
 
     body: Superquadric
     surface: np.ndarray
-
-    @classmethod
-    def of(cls, body: Superquadric, rng: np.random.Generator) -> _Placed:
-        return cls(body, body.sample_surface(1500, rng, oversampling=2))
 
     def move(self, by: np.ndarray) -> _Placed:
         return _Placed(self.body.transformed(np.array([0.0, 0.0, 0.0, 1.0]), by), self.surface + by)

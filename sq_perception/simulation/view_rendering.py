@@ -124,7 +124,8 @@ def _render_view(
         outliers = int(len(seen) * OUTLIERS_PER_END)
         anchor[2] = seen[len(seen) - 1 - outliers]
         extent = anchor[2] - seen[outliers]
-        top, bottom, left, right = _limits(surface)
+        rows, columns = np.nonzero(surface > _NOTHING)
+        top, bottom, left, right = rows.min(), rows.max(), columns.min(), columns.max()
         extent = max(extent, max(bottom - top, right - left) * side / pixels if is_fitted else side / MARGIN)
         done = abs(extent * MARGIN - side) <= (0.005 + 1.5 * is_fitted / pixels) * side
         if done and not is_missed:
@@ -183,13 +184,6 @@ def _cast(
                 hit = nx * (eye_1 - px) + ny * (eye_2 - py) + nz * (eye_3 - pz) > 0.0
             if hit:
                 surface[i, j] = (np.floor((t3 - t) / quantum) + 0.5) * quantum if quantum > 0.0 else t3 - t
-
-
-@kernel
-def _limits(surface: np.ndarray) -> tuple[int, int, int, int]:
-    """Return first and last row, first and last column with a visible point."""
-    rows, columns = np.nonzero(surface > _NOTHING)
-    return int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())
 
 
 @kernel

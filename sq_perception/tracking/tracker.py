@@ -138,7 +138,10 @@ class Tracker:
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
         bodies = tuple(body.predict(elapsed, stamp) for body in self._bodies)
         repeated = _repeat(bodies, frame) if frame.repeats.all() else None
-        here = _pairs_in_place(bodies, frame) if repeated is None else Pairs.none()
+        here = Pairs.none()
+        if repeated is None:
+            states, covariances = stack(bodies)
+            here = association.pairs_in_place(states, covariances + _least(states), frame.state, frame.covariance)
         missing = np.array([body.observation is None for body in repeated or bodies], dtype=bool)
         missing[here.track] = False
         unseen = stack([body for body, is_unseen in zip(bodies, missing, strict=True) if is_unseen])[0]
@@ -148,8 +151,8 @@ class Tracker:
             bodies = repeated
         else:
             there = _pairs_elsewhere(bodies, frame, here, missing)
-            bodies, pairs = _count_jumps(bodies, here, there), here + there
-            bodies, pairs_left = _see_again(bodies, pairs, frame)
+            pairs = here + there
+            bodies, pairs_left = _see_again(_count_jumps(bodies, here, there), pairs, frame)
             bodies = _fuse(bodies, pairs_left, frame)
             new = np.delete(np.arange(len(recoveries)), pairs.observed)
         bodies += tuple(_birth(self.births + n, int(k), frame) for n, k in enumerate(new, 1))
@@ -196,11 +199,6 @@ def _repeat(bodies: _Bodies, frame: _Frame) -> _Bodies | None:
     for index, k in enumerate(tracks):
         after[k] = after[k].see_again(index, frame.state[index], frame.stamp)
     return tuple(after)
-
-
-def _pairs_in_place(bodies: _Bodies, frame: _Frame) -> Pairs:
-    states, covariances = stack(bodies)
-    return association.pairs_in_place(states, covariances + _least(states), frame.state, frame.covariance)
 
 
 def _pairs_elsewhere(bodies: _Bodies, frame: _Frame, here: Pairs, missing: np.ndarray) -> Pairs:
