@@ -24,15 +24,12 @@ from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
 
 
 class Closings(NamedTuple):
-    """Directions (k, 3) along which a body ``owner`` may be gripped, reaches (k,), and sigmas (k, 2) of both sides.
+    """k directions along which bodies may be gripped."""
 
-    The direction points to the first side.
-    """
-
-    owner: np.ndarray
-    along: np.ndarray
-    reach: np.ndarray
-    sigma: np.ndarray
+    owner: np.ndarray  # int (k,), the bodies
+    along: np.ndarray  # (k, 3), to the first side
+    reach: np.ndarray  # (k,)
+    sigma: np.ndarray  # (k, 2), of both sides
 
 
 class Approaches(NamedTuple):

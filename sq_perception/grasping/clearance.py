@@ -79,10 +79,7 @@ def _gap(
     box: np.ndarray, centre: np.ndarray, axes: np.ndarray, reach: np.ndarray, body: np.ndarray, enough: float,
     way: np.ndarray,
 ) -> float:
-    """Return the gap of a box to a body, in the box's frame, along ``way`` (3,).
-
-    Any gap that is ``enough`` will do.
-    """
+    """Return the gap of a box to a body, in the box's frame, along ``way`` (3,); any that is ``enough`` will do."""
     best = -1.0
     for i in range(3):
         gap = abs(centre[i] - box[i]) - box[3 + i] - reach[i]
@@ -165,7 +162,7 @@ def _gaps_to_cells(
 ) -> np.ndarray:
     """Do as :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.
 
-    Cells that are out of reach are passed over; their points are within ``across`` metres of their ``middles`` (3, c).
+    They are within ``across`` metres of their ``middles`` (3, c): cells that are out of reach are passed over.
     """
     found = np.empty(len(frames))
     of_cells, of_points = np.empty(middles.shape[1]), np.empty(points.shape[1])

@@ -53,10 +53,7 @@ class KnownBodies:
 
     @classmethod
     def of(cls, bodies: Superquadric, covariance: np.ndarray | None) -> KnownBodies:
-        """Make them from a NumPy batch (n,) and covariances (n, 11, 11); an unknown variance becomes a wide guess.
-
-        Raises ValueError for covariances of another shape.
-        """
+        """Make them of a NumPy batch (n,) and covariances (n, 11, 11); an unknown variance becomes a wide guess."""
         flat = np.ascontiguousarray(bodies.to_numbers(), dtype=float)
         turns = np.ascontiguousarray(bodies.rotation_matrix)
         wide = np.zeros((len(flat), 9))
@@ -97,7 +94,7 @@ class KnownBodies:
     def middle_angles(self, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the angle (k,) between directions (k, 3) and the normals where central lines along them leave.
 
-        The gradient of the gauge is the same all along such a line, but for tapers, which are left out of account.
+        Tapers are left out of account: without them the gauge has the same gradient all along such a line.
         """
         size, e1, e2 = self.flat[owner, :3], self.flat[owner, 3], self.flat[owner, 4]
         q = np.abs((directions[:, None] @ self.turns[owner])[:, 0]) / size

@@ -170,10 +170,7 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
 
 
 def _probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """Return each body's ``count`` best grasps of a probability of 5 % and more.
-
-    Things without any get the best one's weakest margin as the reason.
-    """
+    """Return each body's ``count`` best grasps of 5 % and more; the weakest margin is why a thing has none."""
     found = trials.first(count, np.log(0.05))
     without = trials.at(~np.isin(things[trials.owner], things[found.owner]))
     without = without._replace(owner=things[without.owner]).first(1)

@@ -22,10 +22,6 @@ pass: of 247 such sides, 3.3 mm with the 2 mm of the hand (30 scenes of benchmar
 PASSES = 0.001
 """Metres by which a finger may come down on the edge of an object: half of those that did passed it and pushed it aside
 (60 household objects in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
-NEARER = 0.4
-"""Sigmas by which sides are nearer than fits say, of 797 tried ones that were known to more than 3.5 mm: medians of 0.3
-to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where
-they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
 
 
@@ -70,7 +66,9 @@ class Trials(NamedTuple):
 
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
     """Return log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
-    return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
+    # Sides are nearer than fits say, by 0.4 sigma: medians of 0.3 to 0.6 of 797 tried sides known to more than 3.5 mm
+    # (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported).
+    return log_phi(gap + PASSES + 0.4 * sigma, np.hypot(sigma, placement))
 
 
 def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:

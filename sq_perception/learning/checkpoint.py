@@ -88,10 +88,7 @@ def save(
 
 
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
-    """A network as a module of torch, in evaluation mode; the path as :func:`resolve` takes it.
-
-    Raises CheckpointError as :func:`read`.
-    """
+    """A network as a module of torch, in evaluation mode; path and errors as of :func:`read`."""
     from sq_perception.learning.networks import Regressor
 
     return _module(Regressor, *read(RegressorConfig, path)).to(device).eval()

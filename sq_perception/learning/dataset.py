@@ -111,8 +111,7 @@ def draw_views(
 ) -> tuple[np.ndarray, Superquadric]:
     """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.
 
-    Occluders and framing are those of the source's disturbance, or the ones given; noise, holes and edges are left to
-    :meth:`Disturbance.applied`, which may change a view anew each time it is used.
+    Noise, holes and edges are left to :meth:`Disturbance.apply`, which changes a view anew each time it is used.
     """
     source = source or ViewSource()
     pinhole_share, disturbance = source.pinhole_share, source.disturbance
@@ -135,10 +134,7 @@ def draw_views(
 
 
 def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
-    """Render the thesis' 8 bit images of bodies (n,) of the cube frame, as a network takes them.
-
-    Returns float32 (n, p, p), z of the surface, 0 for background.
-    """
+    """The thesis' 8 bit images of bodies (n,) of the cube frame: float32 (n, p, p), z, and 0 for background."""
     camera = unit_cube.camera(pixels)
     grey = np.empty((len(bodies), pixels, pixels), np.uint8)
     for frame, body in zip(grey, unit_cube.optical_from_cube(bodies), strict=True):
@@ -147,11 +143,10 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
 
 
 class ViewPool:
-    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions.
+    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions and noise.
 
-    Rendering costs as much as a training step.  Each batch renders only ``batch / reuse`` new views, which replace the
-    oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position, and with new noise
-    each time.
+    Rendering costs as much as a training step: each batch renders only ``batch / reuse`` new views, which replace the
+    oldest of the pool.
     """
 
     def __init__(

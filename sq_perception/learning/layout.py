@@ -26,10 +26,7 @@ TORCHVISION_BLOCK = ("conv1", "bn1", "conv2", "bn2", "downsample")
 
 
 def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:
-    """Name and shape of every weight.
-
-    Raises ValueError for numbers of channels or outputs that are no positive integers.
-    """
+    """Name and shape of every weight; a ValueError for channels or outputs that are no positive integers."""
     found = _masks(config) if isinstance(config, MaskConfig) else _bodies(config)
     if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):
         raise ValueError("expected positive integers as numbers of channels and outputs")

@@ -153,10 +153,7 @@ def render_loss(
 
 @dataclass(frozen=True)
 class Objective:
-    """A loss and its settings; see the module.
-
-    Raises ValueError for a loss of another name.
-    """
+    """A loss and its settings; see the module.  Raises ValueError for another name."""
 
     name: str = "occupancy"
     points: int = 256

@@ -88,10 +88,7 @@ from sq_perception.learning.network_config import (
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut; the first one may halve the resolution.
-
-    ``names`` are those of its five modules.
-    """
+    """Two 3 x 3 convolutions, the first of which may halve the resolution, beside a shortcut; five named modules."""
 
     def __init__(self, channels_in: int, channels_out: int, stride: int, names: Sequence[str] = BLOCK) -> None:
         super().__init__()

@@ -101,10 +101,7 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
 
 
 def read_views(none: Any, paths: list[Path]) -> Any:
-    """All views of some shards, in the form of ``none``.
-
-    Raises ValueError if a shard is damaged, or of another form, or all of them are empty.
-    """
+    """All views of some shards; a ValueError if one is damaged, or not in the form of ``none``, or all are empty."""
     kind, shards = type(none), []
     for path in paths:
         try:

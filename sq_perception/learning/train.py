@@ -116,12 +116,8 @@ def _course(config: TrainingConfig, state: TrainingState, device: torch.device) 
 def validate(
     model: Regressor, views: np.ndarray, truth: Superquadric, objective: Objective | None = None
 ) -> np.ndarray:
-    """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames.
-
-    With an ``objective`` for which some parameters are given, those are taken from the truth.
-    """
-    at_once = 250  # views of a validation that are computed at once
-    flats = [model.predict(views[i : i + at_once]).to_flat() for i in range(0, len(views), at_once)]
+    """Volume IoU (n,) of the network's bodies, with what the ``objective`` gives of the truth, and the true ones."""
+    flats = [model.predict(views[i : i + 250]).to_flat() for i in range(0, len(views), 250)]
     prediction = Superquadric.from_flat(np.concatenate(flats))
     return volume_iou(objective.with_given(prediction, truth) if objective else prediction, truth)
 

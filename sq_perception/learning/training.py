@@ -268,8 +268,7 @@ def _keep(state: TrainingState, config: Run, course: Course, record: dict[str, A
 def mixed_precision(device: str, wanted: bool) -> torch.autocast:
     """Within it a network computes in bfloat16, where that is wanted and the device has such products.
 
-    A processor without them takes 16 times as long for a step in bfloat16 as in float32; one with them is twice
-    as fast.
+    A processor without them takes 16 times as long for a step in it as in float32, one with them half as long.
     """
     has_products = device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     return torch.autocast(device, torch.bfloat16, enabled=wanted and has_products)

@@ -44,10 +44,7 @@ from sq_perception.simulation.thing import (
 
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
-    """Draw a random object, of one of the given kinds or of any.
-
-    Raises ValueError if a kind is unknown or none is given.
-    """
+    """Draw a random object, of one of the given kinds or of any; a ValueError if one is unknown or none is given."""
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, got {names}")

@@ -34,8 +34,9 @@ from sq_perception.imaging.raycast import render
 
 THESIS_SIZE = (25 / 255, 75 / 255)
 TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-MAX_TABLE_BODIES, MOST = 10, 12
-"""Most bodies of a scene and of a crowd."""
+MOST = 12
+"""Most bodies of a crowd."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -74,8 +75,8 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
     Raises ValueError if ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its
     image.
     """
-    if not 1 <= count <= MAX_TABLE_BODIES:
-        raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
+    if not 1 <= count <= 10:
+        raise ValueError(f"count: expected 1 to 10 bodies, got {count}")
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     # In one of seven views ten bodies do not fit.

@@ -175,10 +175,7 @@ def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndar
 def _with_neighbours(
     others: list[np.ndarray], parts: np.ndarray, floor: float, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Add up to three parts (12,) beside the object, as seen from above, without penetration.
-
-    Many are between it and the camera, many touch it.
-    """
+    """Add up to three parts (12,) beside the object, many before it, many touching it, without penetration."""
     rows, level = list(others), level_directions(32)
     for _ in range(rng.choice((0, 0, 0, 0, 1, 1, 1, 2, 2, 3))):
         size = np.exp(rng.uniform(np.log(0.02), np.log(0.1), 3))

@@ -263,10 +263,7 @@ def candidates(observed: np.ndarray) -> np.ndarray:
 def nearest_form(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The form of each of n observations (n, 12) that continues its track (n, 12), and its covariance (n, 11, 11).
-
-    ``track_covariance`` and ``covariance`` are (n, 11, 11), world frame.
-    """
+    """The form of each of n observations (n, 12) that continues its track (n, 12), and its covariance (n, 11, 11)."""
     each = np.arange(len(track))
     unlike = np.abs(observed[:, 3] - observed[:, 4])
     is_box = unlike < 0.5
