@@ -77,7 +77,7 @@ def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings
     return Closings(owner[fits], along[fits], reach[fits], np.stack([there, here], axis=1)[fits])
 
 
-def from_every_side(
+def approach_from_every_side(
     bodies: KnownBodies, found: Closings, gripper: Gripper, around: Surroundings, placement: float
 ) -> Approaches:
     """Approach every closing from every side except below; ``placement`` is the hand's sigma, metres."""

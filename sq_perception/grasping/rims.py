@@ -34,7 +34,7 @@ from sq_perception.grasping.trials import (
 )
 
 
-def at_rims(
+def rim_grasps(
     bodies: Superquadric, which: np.ndarray, gripper: Gripper, around: Surroundings, friction: float, placement: float
 ) -> Trials:
     """Find grasps of bodies ``which`` by their rims, with all margins but those of the surroundings."""

@@ -140,7 +140,7 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
         rng = np.random.default_rng([config.seed, state.step])
         state.held = state.held or [shard.name for shard in _shards(views, config.held)[: config.held]]
         held = read_views(subject.none, [views / name for name in state.held])
-        shards = _some(views, state.held, rng)
+        shards = _choose_shards(views, state.held, rng)
         pool = read_views(subject.none, shards)
 
         def batch() -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
@@ -150,7 +150,7 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
 
         def validate(network: Any) -> dict[str, Any]:
             nonlocal shards, pool
-            if (chosen := _some(views, state.held, rng)) != shards:
+            if (chosen := _choose_shards(views, state.held, rng)) != shards:
                 shards, pool = chosen, read_views(subject.none, chosen)
             return subject.validate(network, held)
 
@@ -171,7 +171,7 @@ def _shards(folder: Path, held: int) -> list[Path]:
     return found
 
 
-def _some(folder: Path, held: Sequence[str], rng: np.random.Generator) -> list[Path]:
+def _choose_shards(folder: Path, held: Sequence[str], rng: np.random.Generator) -> list[Path]:
     """All shards to train on if the memory is to hold them, else some at random, in order."""
     shards = [shard for shard in _shards(folder, len(held)) if shard.name not in held]
     sizes = np.array([shard.stat().st_size for shard in shards])

@@ -23,7 +23,7 @@ from sq_perception.learning.dataset import POOL, Disturbance, ViewPool, ViewSour
 from sq_perception.learning.inference import check_device
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.networks import Regressor, RegressorConfig
-from sq_perception.learning.training import Course, Stopped, TrainingState, run, settings_before, threads
+from sq_perception.learning.training import Course, Stopped, TrainingState, read_settings, run, threads
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 
 __all__ = ["Stopped", "recalibrate", "train", "validate"]
@@ -62,7 +62,7 @@ def train(
                 f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
                 "one number has no deviation to normalise by"
             )
-        before = settings_before(output / "state.safetensors")
+        before = read_settings(output / "state.safetensors")
         state = TrainingState.begin(model, config, output, _OF_A_RUN)
         if any(before.get(name, getattr(config, name)) != getattr(config, name) for name in _VALIDATED):
             state.best, state.plateau = -math.inf, Plateau()  # what was best was so of other views

@@ -95,7 +95,7 @@ class TrainingState:
         Raises CheckpointError also where that one differs in a setting of ``form``.
         """
         path, device = output / "state.safetensors", next(model.parameters()).device
-        before = settings_before(path)
+        before = read_settings(path)
         other = [name for name in form if before.get(name, getattr(config, name)) != getattr(config, name)]
         if other:
             differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
@@ -182,7 +182,7 @@ class TrainingState:
         self.step += 1
 
 
-def settings_before(state: Path) -> dict[str, Any]:
+def read_settings(state: Path) -> dict[str, Any]:
     """What the run of a state was made of, empty where that is not known; CheckpointError where it is not readable."""
     try:
         return dict(json.loads(checkpoint.read_header(state).get("training", "{}")))

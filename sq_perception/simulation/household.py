@@ -37,8 +37,8 @@ from sq_perception.simulation.thing import (
     Thing,
     about,
     assemble,
+    draw_index,
     log_uniform,
-    one_of,
     part,
 )
 
@@ -48,8 +48,8 @@ def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> 
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, got {names}")
-    _, makers = _MAKERS[names[one_of([_MAKERS[name][0] for name in names], rng)]]
-    return makers[one_of([likely for _, likely in makers], rng)][0](rng)
+    _, makers = _MAKERS[names[draw_index([_MAKERS[name][0] for name in names], rng)]]
+    return makers[draw_index([likely for _, likely in makers], rng)][0](rng)
 
 
 def _carton(rng: np.random.Generator) -> Thing:

@@ -113,7 +113,7 @@ def _camera_pose(
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
     aside, below = rng.uniform(-1, 1, 2) * (0.5, 0.4)
     ray = np.array([aside, below, 1.0])
-    look = looking_down(_pitch(ray, elevation, roll), roll)
+    look = optical_from_table(_pitch(ray, elevation, roll), roll)
     matrix = quaternions.to_matrix(look)
     near, usual, far = 0.35, 1.3, 2.0
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
@@ -132,7 +132,7 @@ def level_directions(count: int) -> np.ndarray:
     return np.stack([np.cos(bearings), np.sin(bearings), 0 * bearings], axis=1)
 
 
-def looking_down(pitch: float, roll: float) -> np.ndarray:
+def optical_from_table(pitch: float, roll: float) -> np.ndarray:
     """Return the optical from table quaternion: the axis ``pitch`` below the horizon, towards the table's y."""
     half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
     c, s = np.cos(half), np.sin(half)

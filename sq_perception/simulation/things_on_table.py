@@ -30,7 +30,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing import SIX_WAYS, Thing
-from sq_perception.simulation.thing_setting import level_directions, looking_down
+from sq_perception.simulation.thing_setting import level_directions, optical_from_table
 
 MOST_THINGS = 8
 TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
@@ -127,11 +127,11 @@ def things_on_table(
     wanted = int(rng.integers(1, MOST_THINGS + 1)) if count is None else count
     roll = float(np.deg2rad(5.0))
     for _ in range(15):
-        look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-roll, roll))
+        look = optical_from_table(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-roll, roll))
         eye = np.array([0.0, 0.0, rng.uniform(0.5, 1.2)])
         resting = _arrange(wanted, look, eye, camera, rng, kinds)
         if resting is not None:
-            return _seen(resting, look, eye, camera, rng)
+            return _render(resting, look, eye, camera, rng)
     raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
 
 
@@ -208,7 +208,7 @@ def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) 
     return bool((pixels > margin).all() and (pixels < limit).all())
 
 
-def _seen(
+def _render(
     resting: list[_Resting], look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> ThingsOnTable:
     table = quaternions.to_matrix(look)

@@ -113,7 +113,7 @@ def _render_view(
     rounds, curtain = 4, (anchor[0], anchor[1], side, np.inf)
     if is_occluded:
         _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
-        curtain = (anchor[0], anchor[1], side, _begins(surface, reach, front[5]))
+        curtain = (anchor[0], anchor[1], side, _front_start(surface, reach, front[5]))
         rounds -= 1
     while True:
         _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
@@ -187,7 +187,7 @@ def _cast(
 
 
 @kernel
-def _begins(surface: np.ndarray, reach: np.ndarray, share: float) -> float:
+def _front_start(surface: np.ndarray, reach: np.ndarray, share: float) -> float:
     """Return where an occluder begins in its direction, so that this share of the visible part lies beyond."""
     seen = np.sort(reach.ravel()[surface.ravel() > _NOTHING])
     return seen[int((1.0 - share) * (len(seen) - 1))] if len(seen) else np.inf

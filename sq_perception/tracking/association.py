@@ -226,7 +226,7 @@ def compare(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement
     return Agreement((excess <= 1) & ~slid & ~turned, ~is_outside(SIZE_AND_SHAPE), slid, turned, np.maximum(excess, 1))
 
 
-def same_side(before: np.ndarray, now: np.ndarray) -> bool:
+def is_same_side(before: np.ndarray, now: np.ndarray) -> bool:
     """Whether two vectors are less than 60 degrees apart; False for zero."""
     return bool(before @ now > 0.5 * np.linalg.norm(before) * np.linalg.norm(now))
 

@@ -131,7 +131,7 @@ class Tracker:
             depth = camera.readings(depth)
         rotation, position = state.parse_pose(camera_pose)
         orthographic = camera is not None and not camera.is_pinhole
-        frame = _in_world(recoveries, stamp, rotation, position, orthographic)
+        frame = _to_world(recoveries, stamp, rotation, position, orthographic)
 
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
@@ -161,7 +161,7 @@ class Tracker:
         return tuple(body.publish() for body in self._bodies)
 
 
-def _in_world(
+def _to_world(
     recoveries: Sequence[Observed], stamp: float, rotation: np.ndarray, position: np.ndarray, orthographic: bool
 ) -> _Frame:
     for body in recoveries:
@@ -288,8 +288,8 @@ def _doubt(
         is_out_of_patience = disagreed > 0 and (body.is_moving or disagreed >= PATIENCE)
         if not body.is_moving and body.jumps == 0:
             # What moves errs to the same side again; errors larger than their covariance do so seldom.
-            slid = slid and association.same_side(body.last_error[CENTRE], error[k, CENTRE])
-            turned = turned and association.same_side(body.last_error[TURN], error[k, TURN])
+            slid = slid and association.is_same_side(body.last_error[CENTRE], error[k, CENTRE])
+            turned = turned and association.is_same_side(body.last_error[TURN], error[k, TURN])
         if is_out_of_patience and verdict.fits[k] and (slid or turned):
             turning[k] = turned
             for part, has_moved in ((CENTRE, slid), (TURN, turned)):
