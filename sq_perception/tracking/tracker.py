@@ -137,24 +137,16 @@ class Tracker:
             self.reset()
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
         bodies = tuple(body.predict(elapsed, stamp) for body in self._bodies)
-        repeated = _repeat(bodies, frame) if frame.repeats.all() else None
-        here = Pairs.none()
-        if repeated is None:
-            states, covariances = stack(bodies)
-            here = association.pairs_in_place(states, covariances + _least(states), frame.state, frame.covariance)
-        missing = np.array([body.observation is None for body in repeated or bodies], dtype=bool)
+        states, covariances = stack(bodies)
+        here = association.pairs_in_place(states, covariances + _least(states), frame.state, frame.covariance)
+        missing = np.ones(len(bodies), dtype=bool)
         missing[here.track] = False
-        unseen = stack([body for body, is_unseen in zip(bodies, missing, strict=True) if is_unseen])[0]
-        missing[missing] = visibility.is_missing(unseen, camera, depth, rotation, position)
-        new = np.zeros(0, dtype=int)
-        if repeated is not None:
-            bodies = repeated
-        else:
-            there = _pairs_elsewhere(bodies, frame, here, missing)
-            pairs = here + there
-            bodies, pairs_left = _see_again(_count_jumps(bodies, here, there), pairs, frame)
-            bodies = _fuse(bodies, pairs_left, frame)
-            new = np.delete(np.arange(len(recoveries)), pairs.observed)
+        missing[missing] = visibility.is_missing(states[missing], camera, depth, rotation, position)
+        there = _pairs_elsewhere(bodies, frame, here, missing)
+        pairs = here + there
+        bodies, pairs_left = _see_again(_count_jumps(bodies, here, there), pairs, frame)
+        bodies = _fuse(bodies, pairs_left, frame)
+        new = np.delete(np.arange(len(recoveries)), pairs.observed)
         bodies += tuple(_birth(self.births + n, int(k), frame) for n, k in enumerate(new, 1))
         missing = np.append(missing, np.zeros(len(new), dtype=bool))
         self._bodies, self._stamp, self.births = _survivors(bodies, missing, stamp), stamp, self.births + len(new)
@@ -184,21 +176,6 @@ def _to_world(
         visibility.directions(flat[:, 5:8], rotation, position, orthographic),
         np.array([body.repeats > 0 for body in recoveries], dtype=bool),
     )
-
-
-def _repeat(bodies: _Bodies, frame: _Frame) -> _Bodies | None:
-    """The bodies after a frame whose observations are all equal, to the bit, to those of the frame before; else None.
-
-    Nothing else is compared then: a table at which nothing happens costs next to nothing.
-    """
-    by_answer = {body.answer.tobytes(): k for k, body in enumerate(bodies) if body.answer is not None}
-    tracks = [by_answer.get(each.tobytes(), -1) for each in frame.state]
-    if not tracks or min(tracks) < 0 or len(set(tracks)) < len(tracks):
-        return None
-    after = list(bodies)
-    for index, k in enumerate(tracks):
-        after[k] = after[k].see_again(index, frame.state[index], frame.stamp)
-    return tuple(after)
 
 
 def _pairs_elsewhere(bodies: _Bodies, frame: _Frame, here: Pairs, missing: np.ndarray) -> Pairs:
@@ -241,7 +218,7 @@ def _see_again(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> tuple[_Bodies, P
     is_old = frame.repeats[pairs.observed] & agrees & rests
     after, old = list(bodies), pairs.at(is_old)
     for k, index in zip(old.track, old.observed, strict=True):
-        after[k] = after[k].see_again(int(index), frame.state[index], frame.stamp)
+        after[k] = after[k].see_again(int(index), frame.stamp)
     return tuple(after), pairs.at(~is_old)
 
 
@@ -266,7 +243,7 @@ def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
         insists = body.disagreed >= PATIENCE and not rest.fits[k]
         after[pairs.track[k]] = replace(
             body, estimate=estimate.at(k), seen=body.seen + 1, missed=0, last=frame.stamp,
-            observation=int(pairs.observed[k]), follows=not (rest.slid[k] or rest.turned[k] or insists), answer=None,
+            observation=int(pairs.observed[k]), follows=not (rest.slid[k] or rest.turned[k] or insists),
         )
     return tuple(after)
 

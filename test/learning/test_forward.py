@@ -94,6 +94,7 @@ def test_networks_of_masks(config: MaskConfig | None, rng: np.random.Generator) 
         with torch.inference_mode():
             expected = model.eval()(shown[some]).numpy()
         np.testing.assert_allclose(predictor.logits(views[some]), expected, atol=1e-4)
+    assert expected.shape == (1, pixels, pixels)
     assert expected.std() > 1e-3
 
 

@@ -36,6 +36,9 @@ SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 RUN = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
 
 
+WRONG_SHARES = {"occluded": 1.5, "noisy": -0.1, "pinhole": 2.0, "wide": -1.0}
+
+
 def log_of(folder: Path) -> list[dict[str, Any]]:
     """The records of a run."""
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
@@ -80,6 +83,7 @@ class TestConfig:
             ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
             ("framing: full\npinhole_share: 0.5", "orthographic"),
             ("sharpness_start: -5", "sharpness_start: expected a finite number"),
+            *((f"{name}_share: {value}", f"{name}_share: expected a share") for name, value in WRONG_SHARES.items()),
             ("seed: 18446744073709551616", "seed: expected a number below 2\\^63"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ],

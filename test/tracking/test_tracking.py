@@ -44,34 +44,6 @@ def crossing(k, rng, same=True):
     return [draw(a, noise(), rng), draw(b, noise(), rng)]
 
 
-def test_what_repeats_all_bodies_gives_what_a_comparison_gives(monkeypatch):
-    """Answers of still frames, in any order, some of them missing; new ones, moved bodies and cameras between them."""
-    rng, bodies = np.random.default_rng(0), spread_bodies(4, np.random.default_rng(1))
-    quick, thorough, repeated, shortcuts = Tracker(), Tracker(), tracker_module._repeat, []
-    monkeypatch.setattr(tracker_module, "_repeat", lambda *some: shortcuts.append(repeated(*some)) or shortcuts[-1])
-    seen, pose = [draw(each, noise(), rng) for each in bodies], (np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    for k in range(100):
-        happens = rng.random()
-        if happens < 0.1:
-            seen = [draw(each, noise(), rng) for each in bodies]
-        elif happens < 0.15:
-            seen[rng.integers(4)] = draw(body(centre=rng.normal((0.1, 0.1, 0.8), 0.2)), noise(), rng)
-        elif happens < 0.2:
-            pose = pose[0], rng.normal(0, 0.002, 3)
-        old = [each._replace(repeats=int(happens >= 0.1)) for each in seen]
-        shown = [old[i] for i in rng.permutation(4)[: rng.integers(3, 5)]]
-        tracks = quick.update(shown, 0.05 * k, pose)
-        with monkeypatch.context() as patch:
-            patch.setattr(tracker_module, "_repeat", lambda *_: None)
-            compared = thorough.update(shown, 0.05 * k, pose)
-        for one, other in zip(tracks, compared, strict=True):
-            facts = [(each.id, each.seen, each.state, each.observation) for each in (one, other)]
-            assert facts[0] == facts[1]
-            np.testing.assert_array_equal(one.superquadric.to_flat(), other.superquadric.to_flat())
-            np.testing.assert_array_equal(one.covariance, other.covariance)
-    assert sum(each is not None for each in shortcuts) > 25
-
-
 @pytest.mark.parametrize("same", [True, False])
 def test_ids_survive_a_crossing(same):
     for seed in range(3):
