@@ -42,7 +42,7 @@ from sq_perception.recovery import methods
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.simulation import camera_stages
-from sq_perception.simulation.sensor_noise import REALSENSE_D435
+from sq_perception.simulation.sensor_noise import preset
 
 FEWEST_PIXELS = 400
 BESIDE = 0.015
@@ -79,8 +79,7 @@ def _smoothed(scene: Tabletop, pixels: int) -> Image:
 
 
 def _spatial(scene: Tabletop) -> Image:
-    step = 1 / 32 / (REALSENSE_D435.focal * REALSENSE_D435.baseline)
-    return Image(camera_stages.spatial(scene.depth, 0.5, 20 * step, 2), scene.labels)
+    return Image(camera_stages.spatial(scene.depth, 0.5, 20 * preset("realsense_d435").quantum, 2), scene.labels)
 
 
 def _ring(scene: Tabletop, pixels: int) -> Image:

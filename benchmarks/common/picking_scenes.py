@@ -31,7 +31,7 @@ from sq_perception.simulation import household, sensor_noise
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing import NO_CAVITY, ON_X, ON_Y, UPRIGHT
-from sq_perception.simulation.thing_setting import looking_down
+from sq_perception.simulation.thing_setting import optical_from_table
 from sq_perception.simulation.things_on_table import TABLE_CAMERA
 
 KINDS = ("packed", "pile")
@@ -42,7 +42,7 @@ RIM = (0.02, 0.015)
 """Radius and depth of a cavity that a finger goes into."""
 HALF = 0.12
 GAP = 0.005
-LOOK = looking_down(np.pi / 4, 0.0)
+LOOK = optical_from_table(np.pi / 4, 0.0)
 EYE = np.array([0.0, 0.0, 0.75])
 """Optical from world: p_optical = R(LOOK) p_world + EYE."""
 _BEARINGS = np.linspace(0, 2 * np.pi, 36, endpoint=False)

@@ -33,7 +33,7 @@ from sq_perception.simulation.camera_stages import Stages
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.scenes import plane_depth, turn_about_up
 from sq_perception.simulation.thing import NO_CAVITY
-from sq_perception.simulation.thing_setting import looking_down
+from sq_perception.simulation.thing_setting import optical_from_table
 from sq_perception.simulation.things_on_table import things_on_table
 
 SEED = 7803
@@ -126,7 +126,7 @@ def _crowd(rng: np.random.Generator, camera: Camera) -> _Drawn:
 
 def _view(rng: np.random.Generator, elevation: tuple[float, float], distance: float) -> tuple[np.ndarray, np.ndarray]:
     """Optical from the table's frame: a quaternion, and the place of the point that is looked at."""
-    look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.normal(0, np.deg2rad(2.0)))
+    look = optical_from_table(rng.uniform(*np.deg2rad(elevation)), rng.normal(0, np.deg2rad(2.0)))
     return look, np.array([0.0, 0.0, distance])
 
 

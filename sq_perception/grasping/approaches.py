@@ -22,92 +22,47 @@ from sq_perception.grasping.gripper import Gripper
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
 
-_TOO_WIDE = 0.8
-"""Sigmas of a body's width by which it may exceed the opening: beyond, it fits less than once in five times."""
-_SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
-"""Rotations of the approach about the closing line, from the steepest one."""
-_STEEP = 0.3
-"""Sine of the smallest angle between closing line and vertical."""
-_SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
-"""Slides along the third axis, as shares of the distance at which the finger's width leaves the body."""
-_ABOVE_TABLE = 0.004
-"""Smallest height of a gripper above the table, metres."""
-_ENGAGED = 0.012
-"""Length of finger beyond the near end in a shallow grasp, metres."""
-
 
 class Closings(NamedTuple):
-    """Directions (k, 3) along which a body ``owner`` may be gripped, reaches (k,), and sigmas (k, 2) of both sides.
+    """k directions along which bodies may be gripped."""
 
-    The direction points to the first side.
-    """
-
-    owner: np.ndarray
-    along: np.ndarray
-    reach: np.ndarray
-    sigma: np.ndarray
+    owner: np.ndarray  # int (k,), the bodies
+    along: np.ndarray  # (k, 3), to the first side
+    reach: np.ndarray  # (k,)
+    sigma: np.ndarray  # (k, 2), of both sides
 
 
 class Approaches(NamedTuple):
-    """k closings, each with an approach direction.
-
-    Attributes
-    ----------
-    owner, reach, sigma
-        Those of the closings.
-    frames : (k, 3, 4)
-        The TCP's axes as columns, and the body's centre.
-    tilting : (k, 3)
-        Horizontal, across the closing line: what lies off the centre along it turns the body in the hand.
-    near, near_sigma, across : (k,)
-        Distance from the centre to the near end, its sigma, and the distance to the end along x.
-    opening, shift : (k,)
-        Opening of the fingers, and shift of the hand towards the side that is less sure.
-    deepest : (k,)
-        u at which the palm or the table stops the hand, or the centre is reached.
-    height : (k,)
-        Height of the lowest corner above the table with the TCP in the centre; inf without a table.
-    """
+    """k closings, each with an approach direction; arrays (k,) where not told."""
 
     owner: np.ndarray
     reach: np.ndarray
-    sigma: np.ndarray
-    frames: np.ndarray
+    sigma: np.ndarray  # as of the closings
+    frames: np.ndarray  # (k, 3, 4), the TCP's axes as columns, and the body's centre
     tilting: np.ndarray
-    near: np.ndarray
+    """(k, 3), horizontal, across the closing line: what lies off the centre along it turns the body in the hand."""
+    near: np.ndarray  # distance from the centre to the near end
     near_sigma: np.ndarray
-    across: np.ndarray
-    opening: np.ndarray
-    shift: np.ndarray
-    deepest: np.ndarray
-    height: np.ndarray
+    across: np.ndarray  # distance from the centre to the end along x
+    opening: np.ndarray  # of the fingers
+    shift: np.ndarray  # of the hand, towards the side that is less sure
+    deepest: np.ndarray  # u at which the palm or the table stops the hand, or the centre is reached
+    height: np.ndarray  # of the lowest corner above the table with the TCP in the centre; inf without a table
 
     def at(self, which: np.ndarray) -> Approaches:
         return Approaches(*(part[which] for part in self))
 
 
 class Places(NamedTuple):
-    """k candidate positions of the TCP.
+    """k candidate positions of the TCP."""
 
-    Attributes
-    ----------
-    of : int (k,)
-        Indices of their approaches.
-    ahead : (k,)
-        u.
-    offset : (k, 3)
-        Offset from the body's centre.
-    ends : (k, 2)
-        From the offset along the closing line to the body's surface on either side; NaN where it misses the body.
-    angle : (k,)
-        The larger angle between that line and the normals there; NaN likewise, and where it is too large to hold.
-    """
-
-    of: np.ndarray
-    ahead: np.ndarray
-    offset: np.ndarray
+    of: np.ndarray  # int (k,), indices of their approaches
+    ahead: np.ndarray  # (k,), u
+    offset: np.ndarray  # (k, 3), from the body's centre
     ends: np.ndarray
+    """(k, 2), from the offset along the closing line to the body's surface on either side; NaN where it misses."""
     angle: np.ndarray
+    """(k,), the larger one between that line and the normals there; NaN likewise, and where it is too large to hold."""
 
 
 def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings:
@@ -117,25 +72,24 @@ def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings
     reach, there = bodies.reaches(owner, along)
     _, here = bodies.reaches(owner, -along)
     _, half = bodies.in_place().reaches(owner, along)
-    fits = reach - _TOO_WIDE * half < 0.5 * gripper.opening
+    fits = reach - 0.8 * half < 0.5 * gripper.opening  # else it fits less than once in five times
     fits &= bodies.middle_angles(owner, along) < np.arctan(friction)
     return Closings(owner[fits], along[fits], reach[fits], np.stack([there, here], axis=1)[fits])
 
 
-def from_every_side(
+def approach_from_every_side(
     bodies: KnownBodies, found: Closings, gripper: Gripper, around: Surroundings, placement: float
 ) -> Approaches:
     """Approach every closing from every side except below; ``placement`` is the hand's sigma, metres."""
-    y = np.repeat(found.along, len(_SWINGS), axis=0)
-    owner = np.repeat(found.owner, len(_SWINGS))
-    half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (found.reach, found.sigma))
+    swings = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])  # about the closing line, from the steepest one
+    owner, y, half, side = (np.repeat(numbers, len(swings), axis=0) for numbers in found)
     down = around.down(bodies.middle[owner])
     steep = down - y * (y * down).sum(axis=1, keepdims=True)
     length = np.linalg.norm(steep, axis=1, keepdims=True)
     steep = steep / np.maximum(length, 1e-9)
-    swing = np.tile(_SWINGS, len(found.owner))[:, None]
+    swing = np.tile(swings, len(found.owner))[:, None]
     z = np.cos(swing) * steep + np.sin(swing) * np.cross(y, steep)
-    possible = (length[:, 0] > _STEEP) & ((z * down).sum(axis=1) > 0)
+    possible = (length[:, 0] > 0.3) & ((z * down).sum(axis=1) > 0)  # the closing line is not nearly vertical
     owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
     x, tilting = np.cross(y, z), np.cross(down[possible], y)
     near, near_sigma = bodies.reaches(owner, -z)
@@ -151,8 +105,8 @@ def from_every_side(
     height = np.full(len(owner), np.inf)
     if around.plane is not None:
         height = clearance.heights_above(around.plane, frames, gripper.boxes_at(opening))
-        sink = -(z @ around.plane[:3])
-        low = np.where(sink > 1e-3, (height - _ABOVE_TABLE) / np.maximum(sink, 1e-3), np.inf)
+        sink = -(z @ around.plane[:3])  # down to 4 mm above the table
+        low = np.where(sink > 1e-3, (height - 0.004) / np.maximum(sink, 1e-3), np.inf)
         deepest = np.minimum(deepest, low)
     return Approaches(owner, half, side, frames, tilting, near, near_sigma, across, opening, shift, deepest, height)
 
@@ -163,15 +117,17 @@ def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: f
     A body without any such place has all of its places.  ``steepest`` is the angle to the normals up to which a pad may
     hold, radians.
     """
-    shallow = np.minimum(_ENGAGED - every.near - gripper.tip, every.deepest)
+    # Shares of the distance at which the finger's width leaves the body.
+    slides = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
+    shallow = np.minimum(0.012 - every.near - gripper.tip, every.deepest)  # so much finger beyond the near end
     rows = np.flatnonzero(every.deepest > LEAST_ENGAGED - every.near - gripper.tip)
     depth = np.stack([every.deepest, 0.5 * (every.deepest + shallow), shallow], axis=1)[rows]
-    slide = np.maximum(every.across[rows] - 0.5 * gripper.finger_width, 0.0)[:, None] * _SLIDES
-    count = len(_SLIDES) * depth.shape[1]
-    u = np.repeat(depth, len(_SLIDES), axis=1).ravel()
+    slide = np.maximum(every.across[rows] - 0.5 * gripper.finger_width, 0.0)[:, None] * slides
+    count = len(slides) * depth.shape[1]
+    u = np.repeat(depth, len(slides), axis=1).ravel()
     v = np.tile(slide, (1, depth.shape[1])).ravel()
     of = np.repeat(rows, count)
-    distinct = (v != 0) | (np.tile(np.arange(count) % len(_SLIDES), len(rows)) == 0)
+    distinct = (v != 0) | (np.tile(np.arange(count) % len(slides), len(rows)) == 0)
     u, v, of = u[distinct], v[distinct], of[distinct]
 
     # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.

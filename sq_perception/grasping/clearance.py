@@ -22,8 +22,6 @@ from sq_perception.geometry.kernels import inline_kernel, kernel, support
 
 FAR, NEAR = 0.05, 0.02
 """Largest gap to a body and distance to a point, metres; larger ones are cut off, as nothing depends on them."""
-_CELL = 0.03
-"""Side of the cubes that group points, metres."""
 _STRAY = 3
 """Number of nearest points that are ignored as flying pixels."""
 
@@ -36,18 +34,12 @@ def gaps_to_bodies(
 
     The unit vector n (k, 3) points to the body, in the frame of the bodies; 0 for none.
 
-    Parameters
-    ----------
-    frames : (k, 3, 4)
-        Axes of the TCP as columns, and its position.
-    boxes : (k, m, 6)
-        Centres and half sizes in the frame of the TCP.
-    owner : int (k,)
-        The body that each is to grasp.
-    flat, turns : (n, 14), (n, 3, 3)
-        Flat parameters with tapers, and rotation matrices of the bodies.
-    whole : int (n,)
-        The body that each is a part of, itself if of none; -1 for a body of parts, in whose place these are.
+    frames: (k, 3, 4), axes of the TCP as columns, and its position.
+    boxes: (k, m, 6), centres and half sizes in the frame of the TCP.
+    owner: int (k,), the body that each is to grasp.
+    flat, turns: (n, 14), (n, 3, 3), parameters with tapers, and rotation matrices of the bodies.
+    whole: int (n,), the body that each is a part of, itself if of none; -1 for a body of parts, in whose place these
+        are.
     """
     least = np.full(len(frames), FAR)
     which = np.full(len(frames), -1)
@@ -87,10 +79,7 @@ def _gap(
     box: np.ndarray, centre: np.ndarray, axes: np.ndarray, reach: np.ndarray, body: np.ndarray, enough: float,
     way: np.ndarray,
 ) -> float:
-    """Return the gap of a box to a body, in the box's frame, along ``way`` (3,).
-
-    Any gap that is ``enough`` will do.
-    """
+    """Return the gap of a box to a body, in the box's frame, along ``way`` (3,); any that is ``enough`` will do."""
     best = -1.0
     for i in range(3):
         gap = abs(centre[i] - box[i]) - box[3 + i] - reach[i]
@@ -157,24 +146,25 @@ def _distance(place: np.ndarray, box: np.ndarray) -> float:
 
 def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return each gripper's distance (k,) to the points (j, 3), but for the few nearest; negative inside."""
-    cell = np.floor(points / _CELL)
+    side = 0.03  # of the cubes that group points, metres
+    cell = np.floor(points / side)
     key = cell @ [1.0, 1e4, 1e8]
     order = np.argsort(key)
     starts = np.flatnonzero(np.diff(key[order], prepend=np.nan, append=np.nan) != 0)
-    middles = (cell[order[starts[:-1]]] + 0.5) * _CELL
-    return _gaps_to_cells(frames, boxes, points[order].T.copy(), middles.T.copy(), starts)
+    middles = (cell[order[starts[:-1]]] + 0.5) * side
+    return _gaps_to_cells(frames, boxes, points[order].T.copy(), middles.T.copy(), starts, 0.5 * math.sqrt(3.0) * side)
 
 
 @kernel
 def _gaps_to_cells(
-    frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray
+    frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray,
+    across: float,
 ) -> np.ndarray:
     """Do as :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.
 
-    Cells that are out of reach are passed over.
+    They are within ``across`` metres of their ``middles`` (3, c): cells that are out of reach are passed over.
     """
     found = np.empty(len(frames))
-    across = 0.5 * math.sqrt(3.0) * _CELL
     of_cells, of_points = np.empty(middles.shape[1]), np.empty(points.shape[1])
     for k in range(len(frames)):
         nearest = np.full(_STRAY + 1, NEAR)

@@ -29,19 +29,13 @@ from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_sl
 
 UNKNOWN = 0.1
 """Default standard deviation, as a share of a half size."""
-_STEP = np.pi / 12
-_NEWTON_STEPS = 4
-_GRAZING = 1e-12
-"""Slope of the gauge, per metre, below which a line does not leave a body."""
-_KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
-"""Rows of the covariance without the exponents."""
 
 
 def _directions() -> np.ndarray:
     """Return (33, 3) closing directions in a body's frame, one of each opposite pair."""
     found = [np.eye(3)]
     for first, second in ((0, 1), (0, 2), (1, 2)):
-        angle = np.delete(np.arange(12), 6)[1:] * _STEP
+        angle = np.delete(np.arange(12), 6)[1:] * (np.pi / 12)
         found.append(np.outer(np.cos(angle), np.eye(3)[first]) + np.outer(np.sin(angle), np.eye(3)[second]))
     return np.concatenate(found)
 
@@ -51,29 +45,15 @@ DIRECTIONS = _directions()
 
 @dataclass(frozen=True, eq=False)
 class KnownBodies:
-    """n bodies with their uncertainty.
+    """n bodies with their uncertainty."""
 
-    Attributes
-    ----------
-    flat, turns : (n, 14), (n, 3, 3)
-        Flat parameters with tapers, and rotation matrices.
-    covariance : (n, 9, 9)
-        Covariances of sizes, centre and turn.
-    """
-
-    flat: np.ndarray
-    turns: np.ndarray
-    covariance: np.ndarray
+    flat: np.ndarray  # (n, 14), parameters with tapers
+    turns: np.ndarray  # (n, 3, 3), rotation matrices
+    covariance: np.ndarray  # (n, 9, 9), of sizes, centre and turn
 
     @classmethod
     def of(cls, bodies: Superquadric, covariance: np.ndarray | None) -> KnownBodies:
-        """Make them from a NumPy batch (n,) and covariances (n, 11, 11); an unknown variance becomes a wide guess.
-
-        Raises
-        ------
-        ValueError
-            For covariances of another shape.
-        """
+        """Make them of a NumPy batch (n,) and covariances (n, 11, 11); an unknown variance becomes a wide guess."""
         flat = np.ascontiguousarray(bodies.to_numbers(), dtype=float)
         turns = np.ascontiguousarray(bodies.rotation_matrix)
         wide = np.zeros((len(flat), 9))
@@ -86,7 +66,7 @@ class KnownBodies:
         given = np.asarray(covariance, dtype=float)
         if given.shape != (len(flat), 11, 11):
             raise ValueError(f"covariance: expected shape ({len(flat)}, 11, 11), got {given.shape}")
-        given = given[:, _KEPT][:, :, _KEPT]
+        given = np.delete(np.delete(given, [3, 4], axis=1), [3, 4], axis=2)  # without the exponents
         variance = np.diagonal(given, axis1=1, axis2=2)
         known = np.isfinite(variance) & (variance >= 0)
         given = np.where(known[:, :, None] & known[:, None, :], given, guess)
@@ -114,7 +94,7 @@ class KnownBodies:
     def middle_angles(self, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Return the angle (k,) between directions (k, 3) and the normals where central lines along them leave.
 
-        The gradient of the gauge is the same all along such a line, but for tapers, which are left out of account.
+        Tapers are left out of account: without them the gauge has the same gradient all along such a line.
         """
         size, e1, e2 = self.flat[owner, :3], self.flat[owner, 3], self.flat[owner, 4]
         q = np.abs((directions[:, None] @ self.turns[owner])[:, 0]) / size
@@ -127,12 +107,8 @@ class KnownBodies:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Find where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
 
-        Returns
-        -------
-        ends : (k, 2)
-            Distances along +direction and against it from the offset, metres; NaN where the line misses the body.
-        angle : (k,)
-            The larger angle of direction to the normals at both ends, radians; NaN likewise and above ``steepest``.
+        Returns the distances (k, 2) along +direction and against it from the offset, NaN where the line misses the
+        body, and the larger angle (k,) to the normals at both ends, NaN likewise and above ``steepest`` radians.
         """
         ends, cosine = np.empty((2, len(owner))), np.empty((2, len(owner)))
         least = np.cos(steepest)
@@ -212,14 +188,14 @@ def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, c
             if way[i, k] != 0.0:
                 run[k] = min(run[k], (half[i] - at[i, k] * np.sign(way[i, k])) / abs(way[i, k]))
         run[k] = max(run[k], 0.0)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(4):
         for k in range(len(run)):
             t = run[k]
             value, g_x, g_y, g_z, _, _, _, _ = gauge_derivatives(
                 x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2, k1, k2
             )
             slope = g_x * u[k] + g_y * v[k] + g_z * w[k]
-            run[k] = t - (value - 1.0) / (slope if slope > _GRAZING else np.nan)
+            run[k] = t - (value - 1.0) / (slope if slope > 1e-12 else np.nan)  # flatter lines do not leave it
     for k in range(len(run)):
         t = run[k]
         _, g_x, g_y, g_z, _, _, _, _ = gauge_derivatives(

@@ -19,11 +19,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-_QUARTER_TURN = (0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))
 _QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 _BOX_FACES = np.array([corners for a, b, c, d in _QUADS for corners in ((a, b, c), (a, c, d))])
-_REACH = 0.1
-"""Length of the straight approach, metres."""
 
 
 def _are_numbers(value: object, shape: tuple[int, ...]) -> bool:
@@ -85,11 +82,11 @@ class Gripper:
         if not (_are_numbers(place, (3,)) and _are_numbers(turn, (4,)) and np.any(turn)):
             raise ValueError(f"link_from_tcp: expected a position and a quaternion, got {self.link_from_tcp}")
 
-    def boxes(self, opening: float, reach: float = _REACH) -> np.ndarray:
+    def boxes(self, opening: float, reach: float = 0.1) -> np.ndarray:
         """Return centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.
 
-        The hand is longer by ``reach``, by which it sweeps the way that it comes, and as wide as the open fingers,
-        which come that way before it.
+        The hand is longer by ``reach``, its straight approach in metres, and as wide as the open fingers, which come
+        that way before it.
         """
         middle, long = 0.5 * (self.tip - self.palm), 0.5 * (self.tip + self.palm)
         aside = 0.5 * (opening + self.finger_thickness)
@@ -100,8 +97,7 @@ class Gripper:
         finger = [0.5 * self.finger_width, 0.5 * self.finger_thickness, long]
         return np.array(
             [
-                [0, aside, middle, *finger],
-                [0, -aside, middle, *finger],
+                [0, aside, middle, *finger], [0, -aside, middle, *finger],
                 [0, 0, -self.palm - 0.5 * z, 0.5 * x, 0.5 * y, 0.5 * z],
             ]
         )
@@ -152,7 +148,7 @@ franka_description."""
 ROBOTIQ_2F_85 = Gripper(
     name="robotiq_2f_85", opening=0.085, finger_width=0.022, finger_thickness=0.014, tip=0.019, palm=0.0335,
     hand=(0.075, 0.165, 0.108), force=100.0, link="robotiq_85_base_link",
-    link_from_tcp=((0.0, 0.0, 0.1415), _QUARTER_TURN),
+    link_from_tcp=((0.0, 0.0, 0.1415), (0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))),
 )
 """Robotiq 2F-85.  Stroke 85 mm, 20 to 235 N: its manual.  The rest follows from the joints in ROS-Industrial's model of
 it (robotiq_2f_85_gripper_visualization): pads of 22 x 37.5 mm; their middle, the TCP, at half of the stroke, from which
@@ -173,13 +169,7 @@ GRIPPERS: Mapping[str, Gripper] = MappingProxyType(
 
 
 def gripper(name: str) -> Gripper:
-    """Return the preset of this name.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
-    """
+    """Return the preset of this name; a ValueError if there is none."""
     if name not in GRIPPERS:
         raise ValueError(f"gripper: expected one of {', '.join(GRIPPERS)}, got {name!r}")
     return GRIPPERS[name]

@@ -43,7 +43,7 @@ from sq_perception.grasping.approaches import Closings
 from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import PANDA, Gripper
 from sq_perception.grasping.plan import Grasp, GraspPlan
-from sq_perception.grasping.rims import at_rims
+from sq_perception.grasping.rims import rim_grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import (
     DENSITY,
@@ -62,22 +62,10 @@ from sq_perception.imaging.camera import Camera
 
 FRICTION = 0.5
 """Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
-_AT_MOST = 2.0
-"""Largest friction, as a multiple of the smallest."""
 PER_BODY = 8
 """Maximum number of grasps returned per body."""
 PLACEMENT = 0.002
 """Standard deviation of the hand's position along each axis, metres: a careful calibration of camera and arm."""
-_SQUARE = np.deg2rad(8.0)
-"""Standard deviation of normals, radians."""
-_HIDDEN = 0.15
-"""Probability that unseen space beside a body is occupied."""
-_CHECKED, _CHECKED_CLOSELY = 200, 16
-"""Number of grasps per body whose distance to other bodies is computed, and of the best whose distance to points is."""
-_SURE = 0.5
-"""Probability of a body's best grasp below which its rims are also tried."""
-_LEAST = 0.05
-"""Probability below which grasps are not returned."""
 
 
 class FittedObject(Protocol):
@@ -150,18 +138,19 @@ def grasps(
     whole[np.setdiff1d(whole, np.flatnonzero(np.bincount(things)[things] == 1))] = -1
     trials = _trials(known, _loads(bodies, things, whole), closings, gripper, around, friction, placement)
     reasons[things[closings.owner]] = "no way for the fingers to come with the table and the palm in their way"
-    reasons[np.setdiff1d(things, things[~_behind(known, around.plane)])] = "behind the plane that bodies stand on"
-    trials = _narrower(known, trials.first(_CHECKED), gripper, placement)
-    trials = _probable(trials, things, _CHECKED, reasons, "nothing holds")
-    trials = _among_others(known, whole, trials, gripper, around, placement)
-    doubtful = np.flatnonzero(~np.isin(things, things[trials.owner[trials.total > np.log(_SURE)]]))
+    reasons[np.setdiff1d(things, things[~_are_behind(known, around.plane)])] = "behind the plane that bodies stand on"
+    checked = 200  # grasps per body whose distance to other bodies is computed
+    trials = _narrow_sides(known, trials.first(checked), gripper, placement)
+    trials = _keep_probable(trials, things, checked, reasons, "nothing holds")
+    trials = _add_surroundings(known, whole, trials, gripper, around, placement)
+    doubtful = np.flatnonzero(~np.isin(things, things[trials.owner[trials.total > np.log(0.5)]]))
     if len(doubtful):
-        rims = at_rims(bodies, doubtful, gripper, around, friction, placement)
-        trials = trials.join(_among_others(known, whole, rims, gripper, around, placement))
+        rims = rim_grasps(bodies, doubtful, gripper, around, friction, placement)
+        trials = trials.join(_add_surroundings(known, whole, rims, gripper, around, placement))
     trials = trials._replace(owner=things[trials.owner])
-    trials = _probable(trials, np.arange(count), PER_BODY, reasons, "in the way")
+    trials = _keep_probable(trials, np.arange(count), PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
-    return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
+    return GraspPlan(tuple(_to_grasps(trials)), tuple(reasons))
 
 
 def _loads(bodies: Superquadric, things: np.ndarray, whole: np.ndarray) -> np.ndarray:
@@ -172,7 +161,7 @@ def _loads(bodies: Superquadric, things: np.ndarray, whole: np.ndarray) -> np.nd
     return np.column_stack([of_thing, moment / of_thing[:, None]])[things]
 
 
-def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
+def _are_behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
     """Return which bodies (n,) lie wholly behind the plane."""
     if plane is None:
         return np.zeros(len(bodies), dtype=bool)
@@ -180,9 +169,9 @@ def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
     return np.asarray(bodies.middle @ plane[:3] + top + plane[3] < 0)
 
 
-def _probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:
-    """Return each body's ``count`` best grasps; for things without any, the best one's weakest margin as the reason."""
-    found = trials.first(count, np.log(_LEAST))
+def _keep_probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:
+    """Return each body's ``count`` best grasps of 5 % and more; the weakest margin is why a thing has none."""
+    found = trials.first(count, np.log(0.05))
     without = trials.at(~np.isin(things[trials.owner], things[found.owner]))
     without = without._replace(owner=things[without.owner]).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
@@ -203,9 +192,9 @@ def _trials(
     placement: float,
 ) -> Trials:
     """Return every closing from every side, at every depth and slide, with the margins of the body alone."""
-    narrow, broad = np.arctan([friction, _AT_MOST * friction])
-    cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
-    every = approaches.from_every_side(bodies, found, gripper, around, placement)
+    narrow, broad = np.arctan([friction, 2 * friction])
+    cone, doubt = 0.5 * (narrow + broad), np.hypot(np.deg2rad(8.0), (broad - narrow) / np.sqrt(12))  # and of normals
+    every = approaches.approach_from_every_side(bodies, found, gripper, around, placement)
     places = approaches.places(bodies, every, gripper, broad)
     ways, u, angle = every.at(places.of), places.ahead, places.angle
     owner, (turn, centre) = ways.owner, np.split(ways.frames, [3], axis=2)
@@ -230,7 +219,7 @@ def _trials(
     return Trials(owner, frames, ways.opening, 2 * ways.reach, logs, sides)
 
 
-def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:
+def _narrow_sides(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:
     """Return the trials with better margins where fingers end above the middle, so above the widest section."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
     beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
@@ -247,7 +236,7 @@ def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: 
     return trials
 
 
-def _among_others(
+def _add_surroundings(
     bodies: KnownBodies, whole: np.ndarray, trials: Trials, gripper: Gripper, around: Surroundings, placement: float,
 ) -> Trials:
     """Return the best trials with the margins of the surroundings."""
@@ -258,18 +247,19 @@ def _among_others(
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
     trials.logs[near, 6] = log_passing(gap[near], sigma, placement)
-    trials = trials.first(_CHECKED_CLOSELY)
+    trials = trials.first(16)  # whose distance to points is computed
     boxes = gripper.boxes_at(trials.opening)
     gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
     if around.camera is not None:
-        _where_hidden(trials, gap, gripper, around, placement)
+        _weight_hidden(trials, gap, gripper, around, placement)
     doubt = log_phi(gap + PASSES, np.hypot(POINT_SIGMA, placement))
     trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
-    trials.logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
+    # Unseen space beside a body is occupied with a probability of 15 %.
+    trials.logs[:, 8] = np.log1p(-0.15 * around.unseen(trials.frames, boxes[:, :2]))
     return trials
 
 
-def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
+def _weight_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
     """Weight sides and near ends by the share that the image does not show to be empty; points tell the rest."""
     turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
     hidden = around.hidden_share(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
@@ -278,7 +268,7 @@ def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Sur
     trials.logs[:, 2] = np.log1p(hidden[:, 2] * np.expm1(trials.logs[:, 2]))
 
 
-def _as_grasps(trials: Trials) -> Iterator[Grasp]:
+def _to_grasps(trials: Trials) -> Iterator[Grasp]:
     """Convert all trials to grasps, the most probable first."""
     total = trials.total
     order = np.argsort(-total, kind="stable")

@@ -33,43 +33,31 @@ from sq_perception.grasping.trials import (
     weight,
 )
 
-_BEARINGS = np.arange(24) * np.pi / 12
-_INSETS = np.array([0.012, 0.02, 0.03])
-"""Depths of the fingers' ends below the rim, metres."""
-_BEYOND = 0.015
-"""Distance outside of a body up to which points may be its rim, metres."""
-_HIGH, _THIN = 0.006, 0.012
-"""Height of the rim, and its largest thickness, metres."""
-_STRAY = 3
-"""Index of the point of a bearing, from the highest on, that is the top: flying pixels may be above it."""
-_UPRIGHT = 0.9
-"""Share of rims that held where all other margins were sure: 31 of 35 that scenes of benchmarks/picking.py from
-seed 20000 on, none of which is reported, ended with.  In place of friction: how steep a wall is, is not looked at."""
-_WALLS = 0.3
-"""Share of the volume of a vessel that is solid: walls of 4 mm of one 8 cm wide and 10 cm high."""
 
-
-def at_rims(
+def rim_grasps(
     bodies: Superquadric, which: np.ndarray, gripper: Gripper, around: Surroundings, friction: float, placement: float
 ) -> Trials:
     """Find grasps of bodies ``which`` by their rims, with all margins but those of the surroundings."""
     found = [] if around.plane is None else [rim for k in which for rim in _rims(bodies[k], int(k), gripper, around)]
-    owner = np.array([rim[0] for rim in found], dtype=int).repeat(len(_INSETS))
-    inset = np.tile(_INSETS, len(found))
-    width = np.array([rim[2] for rim in found]).repeat(len(_INSETS))
-    frames = np.array([rim[1] for rim in found]).reshape(-1, 3, 4).repeat(len(_INSETS), axis=0)
+    insets = np.array([0.012, 0.02, 0.03])  # of the fingers' ends below the rim, metres
+    owner = np.array([rim[0] for rim in found], dtype=int).repeat(len(insets))
+    inset = np.tile(insets, len(found))
+    width = np.array([rim[2] for rim in found]).repeat(len(insets))
+    frames = np.array([rim[1] for rim in found]).reshape(-1, 3, 4).repeat(len(insets), axis=0)
     frames[:, :, 3] += (inset - gripper.tip)[:, None] * frames[:, :, 2]
     sigma = np.hypot(POINT_SIGMA, placement)
     opening = np.minimum(width + 2 * (CLEARANCE + 2 * sigma), gripper.opening)
     boxes = gripper.boxes_at(opening)
     middle = np.linalg.norm(frames[:, :, 3] - bodies.translation[owner], axis=1)
-    mass = _WALLS * DENSITY * bodies.volume()[owner]
+    mass = 0.3 * DENSITY * bodies.volume()[owner]  # walls of 4 mm of a vessel 8 cm wide and 10 cm high
     logs = np.zeros((len(owner), len(MARGINS)))
     sides = np.repeat(log_phi(0.5 * (opening - width) + PASSES, sigma)[:, None], 2, axis=1)
     logs[:, 0] = sides.sum(axis=1)
     logs[:, 1] = log_phi(inset - LEAST_ENGAGED, sigma)
     logs[:, 2] = log_phi(gripper.palm + gripper.tip - inset, sigma)
-    logs[:, 3] = np.log(_UPRIGHT)
+    # In place of friction, as nothing tells how steep a wall is: of rims whose other margins were sure 31 of 35 held
+    # in scenes of benchmarks/picking.py from seed 20000 on, none of which is reported.
+    logs[:, 3] = np.log(0.9)
     logs[:, 4] = weight(mass, middle, 2 * friction * gripper.force, inset)
     if around.plane is not None:
         heights = clearance.heights_above(around.plane, frames, boxes)
@@ -82,22 +70,27 @@ def at_rims(
 def _rims(
     body: Superquadric, owner: int, gripper: Gripper, around: Surroundings
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim."""
+    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim.
+
+    A rim is 6 mm high, up to 12 mm thick and up to 15 mm outside of the body.
+    """
     assert around.plane is not None
     upwards = around.plane[:3] @ body.rotation_matrix
     axis = int(np.argmax(np.abs(upwards)))
     up, first = np.sign(upwards[axis]) * body.rotation_matrix[:, axis], body.rotation_matrix[:, axis - 1]
-    outwards = np.outer(np.cos(_BEARINGS), first) + np.outer(np.sin(_BEARINGS), np.cross(up, first))
+    bearings = np.arange(24) * np.pi / 12
+    outwards = np.outer(np.cos(bearings), first) + np.outer(np.sin(bearings), np.cross(up, first))
     reach, high = body.support(outwards), float(body.support(up[None])[0])
     points = around.points - body.translation
-    points = points[(np.abs(points @ up) < high + _BEYOND) & (np.linalg.norm(points, axis=1) < reach.max() + high)]
+    points = points[(np.abs(points @ up) < high + 0.015) & (np.linalg.norm(points, axis=1) < reach.max() + high)]
     height, away = points @ up, points @ outwards.T
     aside = np.abs(points @ np.cross(up, outwards).T)
-    there = (aside < 0.5 * gripper.finger_width) & (away > 0.6 * reach) & (away < reach + _BEYOND)
-    for k in np.flatnonzero(there.sum(axis=0) >= _STRAY):
-        top = np.sort(height[there[:, k]])[-_STRAY]
-        inner, outer = np.percentile(away[there[:, k] & (height > top - _HIGH), k], [10, 90])
-        if outer - inner <= _THIN:
+    there = (aside < 0.5 * gripper.finger_width) & (away > 0.6 * reach) & (away < reach + 0.015)
+    stray = 3  # from here on below the highest points: flying pixels may be above
+    for k in np.flatnonzero(there.sum(axis=0) >= stray):
+        top = np.sort(height[there[:, k]])[-stray]
+        inner, outer = np.percentile(away[there[:, k] & (height > top - 0.006), k], [10, 90])
+        if outer - inner <= 0.012:
             axes = np.stack([np.cross(up, outwards[k]), outwards[k], -up], axis=1)
             axes[:, 0] = np.cross(axes[:, 1], axes[:, 2])
             place = body.translation + 0.5 * (inner + outer) * outwards[k] + top * up

@@ -10,18 +10,8 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import hole_filling
 from sq_perception.imaging.camera import Camera, Lens
 
-_BEHIND = 0.015
-"""Distance behind a reading, metres, beyond which space is unseen."""
-_EMPTY = 0.005
-"""Distance before a reading, metres, beyond which space is empty."""
-_NEAREST = 1e-3
-"""Smallest depth that the image shows, metres."""
-_SPACING = 0.005
-"""Spacing of kept points, metres."""
 _MOST = 6000
 """Maximum number of kept points."""
-_ABOVE = 0.008
-"""Height below which points belong to the table, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +59,9 @@ class Surroundings:
 
     @classmethod
     def of_image(cls, depth: np.ndarray, camera: Camera, plane: np.ndarray | None) -> Surroundings:
-        """Extract from a depth image its plane, a thinned set of the points above it, and what it hides.
+        """Extract from a depth image its plane, points 8 mm above it thinned to a spacing of 5 mm, and what it hides.
 
-        Parameters
-        ----------
-        depth : float (height, width)
-            Metres, not positive or not finite where nothing was measured.
-        camera
-            A pinhole camera.
-        plane : (4,), optional
+        ``depth`` is in metres, not positive or not finite where nothing was measured, its camera a pinhole one.
         """
         depth = camera.readings(depth)
         z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
@@ -86,9 +70,9 @@ class Surroundings:
         else:
             across = plane[0] * (np.arange(camera.width) - camera.cx) / camera.fx
             down = plane[1] * (np.arange(camera.height) - camera.cy) / camera.fy
-            rows, columns = np.nonzero(z * (across + down[:, None] + plane[2]) + plane[3] > _ABOVE)
+            rows, columns = np.nonzero(z * (across + down[:, None] + plane[2]) + plane[3] > 0.008)
         points = camera.unproject(columns, rows, z[rows, columns].astype(float))
-        _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
+        _, kept = np.unique(np.floor(points / 0.005) @ [1.0, 1e4, 1e8], return_index=True)
         if len(kept) > _MOST:
             kept = kept[np.linspace(0, len(kept) - 1, _MOST).astype(int)]
         return cls(plane, points[kept], hole_filling.fill(z)[0], camera)
@@ -101,15 +85,15 @@ class Surroundings:
         return np.where(length > 1e-6, places / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
 
     def unseen(self, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
-        """Return the share (k,) of some boxes (k, m, 6) at frames (k, 3, 4) that is behind what the image shows."""
+        """Return the share (k,) of boxes (k, m, 6) at frames (k, 3, 4) that is 15 mm behind what the image shows."""
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
         local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
-        return np.asarray(np.mean(self.beyond(places) < -_BEHIND, axis=1))
+        return np.asarray(np.mean(self.beyond(places) < -0.015, axis=1))
 
     def hidden_share(self, places: np.ndarray) -> np.ndarray:
-        """Return the share (...,) of places (..., j, 3) that the image does not show to be empty."""
-        return np.asarray(np.mean(~(self.beyond(places) > _EMPTY), axis=-1))
+        """Return the share (...,) of places (..., j, 3) that the image does not show to be empty for another 5 mm."""
+        return np.asarray(np.mean(~(self.beyond(places) > 0.005), axis=-1))
 
     def beyond(self, places: np.ndarray) -> np.ndarray:
         """Return how far the reading at the pixel of places (..., 3) is behind them, metres; NaN for no reading."""
@@ -127,7 +111,7 @@ def _pixels_at(places: np.ndarray, width: int, height: int, lens: Lens) -> np.nd
     found = np.full(len(places), -1)
     for k in range(len(places)):
         z = places[k, 2]
-        if z > _NEAREST:
+        if z > 1e-3:
             column, row = np.rint(lens.fx * places[k, 0] / z + lens.cx), np.rint(lens.fy * places[k, 1] / z + lens.cy)
             if 0 <= column < width and 0 <= row < height:
                 found[k] = int(row) * width + int(column)

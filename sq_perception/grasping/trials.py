@@ -22,15 +22,7 @@ pass: of 247 such sides, 3.3 mm with the 2 mm of the hand (30 scenes of benchmar
 PASSES = 0.001
 """Metres by which a finger may come down on the edge of an object: half of those that did passed it and pushed it aside
 (60 household objects in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
-NEARER = 0.4
-"""Sigmas by which sides are nearer than fits say, of 797 tried ones that were known to more than 3.5 mm: medians of 0.3
-to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where
-they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
-_ACCELERATION = 9.81 + 2.0
-"""Acceleration of gravity and of the lift, m/s^2."""
-_PAD_RADIUS = 0.006
-"""Mean lever arm of the friction of a pad of some 18 mm, metres."""
 
 
 class Trials(NamedTuple):
@@ -74,7 +66,9 @@ class Trials(NamedTuple):
 
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
     """Return log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
-    return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
+    # Sides are nearer than fits say, by 0.4 sigma: medians of 0.3 to 0.6 of 797 tried sides known to more than 3.5 mm
+    # (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported).
+    return log_phi(gap + PASSES + 0.4 * sigma, np.hypot(sigma, placement))
 
 
 def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
@@ -84,10 +78,11 @@ def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
     return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
 
 
-def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = _PAD_RADIUS) -> np.ndarray:
+def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = 0.006) -> np.ndarray:
     """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line.
 
-    As a force, and as a torque that the friction holds by its mean ``arm``.
+    As a force, against gravity and a lift with 2 m/s^2, and as a torque that the friction holds by its mean ``arm``,
+    by default that of a pad of some 18 mm.
     """
-    load = np.maximum(1.0, lever / arm) * _ACCELERATION * mass / force
+    load = np.maximum(1.0, lever / arm) * (9.81 + 2.0) * mass / force
     return log_phi(1 / np.maximum(load, 1e-9) - 1, 0.5)

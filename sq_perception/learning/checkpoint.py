@@ -46,7 +46,6 @@ DEFAULT = "robust"
 _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things", MaskConfig: "masks"}
 """Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
-_MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
 
 
 class CheckpointError(ValueError):
@@ -89,10 +88,7 @@ def save(
 
 
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
-    """A network as a module of torch, in evaluation mode; the path as :func:`resolve` takes it.
-
-    Raises CheckpointError as :func:`read`.
-    """
+    """A network as a module of torch, in evaluation mode; path and errors as of :func:`read`."""
     from sq_perception.learning.networks import Regressor
 
     return _module(Regressor, *read(RegressorConfig, path)).to(device).eval()
@@ -152,12 +148,17 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
 
 def read_header(path: Path | str | None = None) -> dict[str, str]:
     """The header's strings alone; raises CheckpointError as :func:`load` does, but looks at no weights."""
-    path = resolve(path)
-    _check_size(path)
+    path, most = resolve(path), 4 * _MAX_PARAMETERS + 2**20
     try:
+        if not path.is_file():
+            raise CheckpointError(f"{path}: no such model file")
+        if path.stat().st_size > most:
+            raise CheckpointError(f"{path}: expected at most {most} bytes, got {path.stat().st_size}")
         with safe_open(path, "np") as file:
             return dict(file.metadata() or {})
-    except (SafetensorError, OSError) as error:
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
+    except SafetensorError as error:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
 
 
@@ -174,24 +175,8 @@ def check(path: Path | str | None = None) -> None:
     _parse_config(path, header, kind)
 
 
-def _check_size(path: Path) -> None:
-    """Raise CheckpointError for a file that is not there, or larger than those of networks."""
-    try:
-        if not path.is_file():
-            raise CheckpointError(f"{path}: no such model file")
-        if path.stat().st_size > _MAX_BYTES:
-            raise CheckpointError(f"{path}: expected at most {_MAX_BYTES} bytes, got {path.stat().st_size}")
-    except OSError as error:
-        raise CheckpointError(f"{path}: cannot be read: {error}") from error
-
-
 def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
-    """The form that a header describes.
-
-    Raises CheckpointError if it describes none.
-    """
-    most_pixels = 1024
-    most_blocks = 64
+    """The form that a header describes; CheckpointError if it describes none."""
     if header.get("format") != _FORMATS[kind]:
         raise CheckpointError(f"{path}: expected a header 'format: {_FORMATS[kind]}', got {header.get('format')!r}")
     if header.get("version") != VERSION:
@@ -200,8 +185,8 @@ def _parse_config(path: Path, header: dict[str, str], kind: type[Config]) -> Con
         values: dict[str, Any] = json.loads(header["config"])
         values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
         config = kind(**values)
-        if config.pixels > most_pixels or config.blocks > most_blocks:
-            raise ValueError(f"expected at most {most_pixels} pixels and {most_blocks} blocks a stage")
+        if config.pixels > 1024 or config.blocks > 64:
+            raise ValueError("expected at most 1024 pixels and 64 blocks a stage")
         if sum(math.prod(shape) for shape in layout.shapes(config).values()) > _MAX_PARAMETERS:
             raise ValueError("the network would be larger than any this package trains")
     except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:

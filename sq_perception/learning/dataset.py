@@ -30,7 +30,7 @@ from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
 from sq_perception.simulation.view_rendering import Occluder, render_views
 
 GREY_LEVELS = 255.0
-_SMALLEST = 1 / 255
+_SMALLEST = 1 / GREY_LEVELS
 """Least depth of a view that is not background."""
 POOL = 4096
 """Views of a pool: a gigabyte of those of the thesis' size."""
@@ -111,8 +111,7 @@ def draw_views(
 ) -> tuple[np.ndarray, Superquadric]:
     """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.
 
-    Occluders and framing are those of the source's disturbance, or the ones given; noise, holes and edges are left to
-    :meth:`Disturbance.applied`, which may change a view anew each time it is used.
+    Noise, holes and edges are left to :meth:`Disturbance.apply`, which changes a view anew each time it is used.
     """
     source = source or ViewSource()
     pinhole_share, disturbance = source.pinhole_share, source.disturbance
@@ -135,10 +134,7 @@ def draw_views(
 
 
 def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
-    """Render the thesis' 8 bit images of bodies (n,) of the cube frame, as a network takes them.
-
-    Returns float32 (n, p, p), z of the surface, 0 for background.
-    """
+    """The thesis' 8 bit images of bodies (n,) of the cube frame: float32 (n, p, p), z, and 0 for background."""
     camera = unit_cube.camera(pixels)
     grey = np.empty((len(bodies), pixels, pixels), np.uint8)
     for frame, body in zip(grey, unit_cube.optical_from_cube(bodies), strict=True):
@@ -146,20 +142,11 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 
-def turn_at_random(
-    images: np.ndarray, bodies: Superquadric, rng: np.random.Generator
-) -> tuple[np.ndarray, Superquadric]:
-    """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
-    turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
-    return move_images(images, turns, mirror), move_bodies(bodies, turns, mirror)
-
-
 class ViewPool:
-    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions.
+    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions and noise.
 
-    Rendering costs as much as a training step.  Each batch renders only ``batch / reuse`` new views, which replace the
-    oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position, and with new noise
-    each time.
+    Rendering costs as much as a training step: each batch renders only ``batch / reuse`` new views, which replace the
+    oldest of the pool.
     """
 
     def __init__(
@@ -178,8 +165,9 @@ class ViewPool:
         self._images[slots], self._flat[slots] = images, bodies.to_flat()
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
-        bodies = Superquadric.from_flat(self._flat[chosen])
-        views, bodies = turn_at_random(self._images[chosen], bodies, self._rng)
+        turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
+        views = move_images(self._images[chosen], turns, mirror)
+        bodies = move_bodies(Superquadric.from_flat(self._flat[chosen]), turns, mirror)
         return self._source.disturbance.apply(views, self._rng), bodies
 
 

@@ -27,9 +27,6 @@ from sq_perception.learning.network_config import (
     side_inputs,
 )
 
-_AT_ONCE = 40
-"""Views that pass through the layers together: 20 things, each seen twice."""
-
 
 class CompactRegressor:
     """:class:`sq_perception.learning.networks.Regressor` with a compact backbone, ready to predict."""
@@ -89,9 +86,10 @@ class CompactMasks:
             stages = [images[0], *images[self.config.blocks :: self.config.blocks]]
             x, side = stages.pop()
             for k in reversed(range(len(stages))):
-                x, side = self._joined[k].compute(
-                    _upsample(x, side, self._up[k], stages[k][0], memory), 2 * side, memory, f"joined {k}"
-                )
+                matrix, bias = self._up[k]
+                sums = memory.framed_images(f"raised to {2 * side}", len(x), 2 * side, len(bias))
+                write_doubled(_inner(x, side) @ matrix + bias, stages[k][0], sums)
+                x, side = self._joined[k].compute(sums, 2 * side, memory, f"joined {k}")
             matrix, bias = self._head
             cells = (_inner(x, side) @ matrix + bias).reshape(len(x), side, side, 2, 2)
             return cells.transpose(0, 1, 3, 2, 4).reshape(len(x), 2 * side, 2 * side)
@@ -114,11 +112,10 @@ class _Network:
 
     def outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
         """Outputs (n, k), float32."""
+        at_once = 40  # views that pass through the layers together: 20 things, each seen twice
+        slices = [slice(first, first + at_once) for first in range(0, len(images), at_once)]
         with one_blas_thread():
-            parts = [
-                self._outputs(images[first : first + _AT_ONCE], more[first : first + _AT_ONCE])
-                for first in range(0, len(images), _AT_ONCE)
-            ]
+            parts = [self._outputs(images[part], more[part]) for part in slices]
         return np.concatenate(parts) if parts else np.empty((0, self._heads[0].shape[1]), np.float32)
 
     def _outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
@@ -155,16 +152,6 @@ class _Backbone:
 
 def _inner(framed: np.ndarray, side: int) -> np.ndarray:
     return framed[:, 1 : side + 1, 1 : side + 1]
-
-
-def _upsample(
-    x: np.ndarray, side: int, up: tuple[np.ndarray, np.ndarray], finer: np.ndarray, memory: Memory
-) -> np.ndarray:
-    """Framed images of twice the side: those of single pixels by ``up``, doubled, added to ``finer``."""
-    matrix, bias = up
-    sums = memory.framed_images(f"raised to {2 * side}", len(x), 2 * side, len(bias))
-    write_doubled(_inner(x, side) @ matrix + bias, finer, sums)
-    return sums
 
 
 def _linear(weights: Weights, names: list[str]) -> tuple[np.ndarray, np.ndarray]:

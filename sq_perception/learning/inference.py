@@ -148,20 +148,14 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
-    """A predictor of hulls, None for the network that ships; the device is one that :func:`check_device` has seen.
-
-    Raises CheckpointError as :func:`checkpoint.read`.
-    """
+    """A predictor of hulls, path and errors as of :func:`checkpoint.read`; :func:`check_device` has seen the device."""
     if _is_cpu(device):
         return ThingPredictor(forward.CompactThings(*checkpoint.read(ThingConfig, path)))
     return ThingPredictor(checkpoint.load_things(path, device))
 
 
 def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
-    """A network of masks, None for the one that ships, computed without torch.
-
-    Raises CheckpointError as :func:`checkpoint.read`.
-    """
+    """A network of masks, computed without torch; path and errors as of :func:`checkpoint.read`."""
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
 
 

@@ -23,14 +23,10 @@ BLOCK = ("first", "first_norm", "second", "second_norm", "shortcut")
 """The modules of a residual block: two convolutions, each with its normalisation, and the way beside them."""
 TORCHVISION_BLOCK = ("conv1", "bn1", "conv2", "bn2", "downsample")
 """What torchvision calls them in ResNet-18."""
-_RESNET18_CHANNELS, _RESNET18_BLOCKS = (64, 128, 256, 512), 2
 
 
 def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:
-    """Name and shape of every weight.
-
-    Raises ValueError for numbers of channels or outputs that are no positive integers.
-    """
+    """Name and shape of every weight; a ValueError for channels or outputs that are no positive integers."""
     found = _masks(config) if isinstance(config, MaskConfig) else _bodies(config)
     if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):
         raise ValueError("expected positive integers as numbers of channels and outputs")
@@ -59,9 +55,9 @@ def _masks(config: MaskConfig) -> Shapes:
     found: Shapes = {}
     _compact(found, config.widths, config.blocks, CHANNELS)
     for k, (fine, coarse) in enumerate(pairwise(config.widths)):
-        _add_pointwise(found, f"up.{k}", coarse, fine)
+        _linear(found, f"up.{k}", coarse, fine, 1, 1)
         _block(found, f"joined.{k}", BLOCK, fine, fine, False)
-    _add_pointwise(found, "head", config.widths[0], CELLS_AT_ONCE)
+    _linear(found, "head", config.widths[0], CELLS_AT_ONCE, 1, 1)
     return found
 
 
@@ -71,10 +67,7 @@ def heads(config: RegressorConfig | ThingConfig) -> dict[str, int]:
         return {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head": 6}
     count = len(DIRECTIONS)
     return {
-        "body_head": BODY_OUTPUTS,
-        "support_head": count,
-        "sigma_head": count,
-        "factor_head": count * config.factors,
+        "body_head": BODY_OUTPUTS, "support_head": count, "sigma_head": count, "factor_head": count * config.factors
     }
 
 
@@ -92,10 +85,10 @@ def _compact(found: Shapes, widths: tuple[int, ...], blocks: int, channels: int)
 
 def _resnet18(found: Shapes) -> int:
     """The weights of :class:`sq_perception.learning.networks.ResNet18`; its channels."""
-    channels = _RESNET18_CHANNELS[0]
+    channels = 64
     _convolution(found, "features.conv1", "features.bn1", 1, channels, 7)
-    for stage, width in enumerate(_RESNET18_CHANNELS, 1):
-        for k in range(_RESNET18_BLOCKS):
+    for stage, width in enumerate((64, 128, 256, 512), 1):
+        for k in range(2):
             _block(found, f"features.layer{stage}.{k}", TORCHVISION_BLOCK, channels, width, channels != width)
             channels = width
     return channels
@@ -118,10 +111,6 @@ def _convolution(found: Shapes, name: str, norm: str, channels_in: int, channels
         found[f"{norm}.{part}"] = (channels_out,)
 
 
-def _add_pointwise(found: Shapes, name: str, channels_in: int, channels_out: int) -> None:
-    """A convolution of single pixels."""
-    found[f"{name}.weight"], found[f"{name}.bias"] = (channels_out, channels_in, 1, 1), (channels_out,)
-
-
-def _linear(found: Shapes, name: str, inputs: int, outputs: int) -> None:
-    found[f"{name}.weight"], found[f"{name}.bias"] = (outputs, inputs), (outputs,)
+def _linear(found: Shapes, name: str, inputs: int, outputs: int, *kernel: int) -> None:
+    """A fully connected layer, or with a ``kernel`` of 1, 1 a convolution of single pixels."""
+    found[f"{name}.weight"], found[f"{name}.bias"] = (outputs, inputs, *kernel), (outputs,)

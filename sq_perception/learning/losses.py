@@ -38,7 +38,7 @@ on the surface: a body may run on behind its silhouette, and the points may even
 
 Free space: a line of sight is empty until it ends, at its point or, on the background, never
 
-    L_LS + w mean_lines max(0, 1 - min g)^2,      min over the empty part of the line.
+    L_LS + 4 mean_lines max(0, 1 - min g)^2,      min over the empty part of the line.
 
 Render loss (7.8 to 7.11)
 
@@ -79,13 +79,10 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_render
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 
-_NOT_ROTATION = ("size", "shape", "translation")
-
 
 def parameter_loss(prediction: Superquadric, truth: Superquadric) -> torch.Tensor:
     """L_MSE(a, e, t) of each body, shape (n,)."""
-    differences = [getattr(prediction, group) - getattr(truth, group) for group in _NOT_ROTATION]
-    return torch.cat(differences, dim=-1).square().mean(dim=-1)
+    return (prediction.to_flat() - truth.to_flat())[..., :8].square().mean(dim=-1)
 
 
 def occupancy_loss(
@@ -156,10 +153,7 @@ def render_loss(
 
 @dataclass(frozen=True)
 class Objective:
-    """A loss and its settings; see the module.
-
-    Raises ValueError for a loss of another name.
-    """
+    """A loss and its settings; see the module.  Raises ValueError for another name."""
 
     name: str = "occupancy"
     points: int = 256
@@ -197,23 +191,17 @@ class Objective:
             if self.name == "mse":
                 return parameter_loss(prediction, truth)
             around = [points_around(truth, self.points // 2, generator, scale) for scale in (1.15, 2.0)]
-            compare = {
-                "occupancy": occupancy_loss,
-                "occupancy_rotation": rotation_loss,
-                "dual": dual_loss,
-            }[self.name]
+            compare = {"occupancy": occupancy_loss, "occupancy_rotation": rotation_loss, "dual": dual_loss}[self.name]
             return compare(prediction, truth, torch.cat(around, dim=1), s)
         row, column = torch.randint(self.stride, (2,), generator=generator, device=views.device).tolist()
         lines, depth = soft_render.of_view(views[:, 0], self.stride, row, column, self.framing)
         if self.name == "render":
-            # D of the soft depth, in units of s.
-            return render_loss(prediction, lines, depth, s, 2.0 * s)
+            return render_loss(prediction, lines, depth, s, density=2 * s)
         smallness = max(0.0, 1 - progress / 0.8)
         loss = least_squares_loss(prediction, lines, depth)
         loss = loss * (prediction.size.prod(dim=-1) / 0.05) ** smallness
         if self.name == "least_squares_free":
-            # Weight w of the free space.
-            loss = loss + 4.0 * free_space_loss(prediction, lines, depth)
+            loss = loss + 4 * free_space_loss(prediction, lines, depth)
             # The same optimum, but a few badly seen bodies, whose squares are a hundred times those of the others, do
             # not make the whole gradient.
             loss = torch.sqrt(loss + 1e-6)

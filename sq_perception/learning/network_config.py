@@ -71,8 +71,8 @@ class RegressorConfig:
         unit = 1 / (1 + xp.exp(-raw[..., :8]))
         low, high = self.size_range
         return Superquadric(
-            low * (high / low) ** unit[..., 0:3], _between(self.shape_range, unit[..., 3:5]),
-            _between(self.translation_range, unit[..., 5:8]), quaternions.from_six(raw[..., 8:]),
+            low * (high / low) ** unit[..., 0:3], _interpolate(self.shape_range, unit[..., 3:5]),
+            _interpolate(self.translation_range, unit[..., 5:8]), quaternions.from_six(raw[..., 8:]),
         )
 
     def view_of(
@@ -177,6 +177,6 @@ def check_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
     return np.ascontiguousarray(views, dtype=np.float32)
 
 
-def _between(bounds: tuple[float, float], unit: Array) -> Array:
+def _interpolate(bounds: tuple[float, float], unit: Array) -> Array:
     low, high = bounds
     return low + (high - low) * unit

@@ -88,10 +88,7 @@ from sq_perception.learning.network_config import (
 
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut; the first one may halve the resolution.
-
-    ``names`` are those of its five modules.
-    """
+    """Two 3 x 3 convolutions, the first of which may halve the resolution, beside a shortcut; five named modules."""
 
     def __init__(self, channels_in: int, channels_out: int, stride: int, names: Sequence[str] = BLOCK) -> None:
         super().__init__()
@@ -101,11 +98,8 @@ class ResidualBlock(nn.Module):
                 nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), nn.BatchNorm2d(channels_out)
             )
         modules = (
-            nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False),
-            nn.BatchNorm2d(channels_out),
-            nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False),
-            nn.BatchNorm2d(channels_out),
-            shortcut,
+            nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False), nn.BatchNorm2d(channels_out),
+            nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False), nn.BatchNorm2d(channels_out), shortcut,
         )
         for name, module in zip(names, modules, strict=True):
             self.add_module(name, module)

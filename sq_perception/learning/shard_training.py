@@ -13,9 +13,10 @@ The network of things
 ---------------------
 Half of the views are shown as in a mirror, of some the extent is kept back.
 
-    loss = mean over views of  -log p(h) / J  +  BODY |h_body - h|  +  CENTRE |mu - h|
+    loss = mean over views of  -log p(h) / J  +  2 |h_body - h|  +  |mu - h|
 
-The likelihood alone makes the first steps wild; the last term leads.  The log has the mean error of h by kind of thing,
+The likelihood is of order 1 where the other terms are of order 0.05, and alone makes the first steps wild; the last
+term leads.  The log has the mean error of h by kind of thing,
 and the standard deviation of error / sigma, which an honest network has at 1.
 
 The network of masks
@@ -55,8 +56,7 @@ from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.segment_views import UNKNOWN, YES, SegmentViews, draw_segment_views
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
-BODY, CENTRE, AROUND = 2.0, 1.0, 0.5
-"""Weights in the losses; the likelihood is of order 1 where those beside it are of order 0.05."""
+AROUND = 0.5
 _KEPT_BACK = 0.1
 """Share of the views without their extent, without the plane, and without other segments."""
 _AT_ONCE = 128
@@ -101,10 +101,7 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
 
 
 def read_views(none: Any, paths: list[Path]) -> Any:
-    """All views of some shards, in the form of ``none``.
-
-    Raises ValueError if a shard is damaged, or of another form, or all of them are empty.
-    """
+    """All views of some shards; a ValueError if one is damaged, or not in the form of ``none``, or all are empty."""
     kind, shards = type(none), []
     for path in paths:
         try:
@@ -143,7 +140,7 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
         rng = np.random.default_rng([config.seed, state.step])
         state.held = state.held or [shard.name for shard in _shards(views, config.held)[: config.held]]
         held = read_views(subject.none, [views / name for name in state.held])
-        shards = _some(views, state.held, rng)
+        shards = _choose_shards(views, state.held, rng)
         pool = read_views(subject.none, shards)
 
         def batch() -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
@@ -153,7 +150,7 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
 
         def validate(network: Any) -> dict[str, Any]:
             nonlocal shards, pool
-            if (chosen := _some(views, state.held, rng)) != shards:
+            if (chosen := _choose_shards(views, state.held, rng)) != shards:
                 shards, pool = chosen, read_views(subject.none, chosen)
             return subject.validate(network, held)
 
@@ -174,7 +171,7 @@ def _shards(folder: Path, held: int) -> list[Path]:
     return found
 
 
-def _some(folder: Path, held: Sequence[str], rng: np.random.Generator) -> list[Path]:
+def _choose_shards(folder: Path, held: Sequence[str], rng: np.random.Generator) -> list[Path]:
     """All shards to train on if the memory is to hold them, else some at random, in order."""
     shards = [shard for shard in _shards(folder, len(held)) if shard.name not in held]
     sizes = np.array([shard.stat().st_size for shard in shards])
@@ -192,8 +189,8 @@ def hull_loss(
     """The loss for true support functions (b, J); see the module."""
     return (
         predicted.negative_log_likelihood(truth).mean() / truth.shape[1]
-        + BODY * body_loss(predicted.body, truth).mean()
-        + CENTRE * (predicted.support - truth).abs().mean()
+        + 2 * body_loss(predicted.body, truth).mean()
+        + (predicted.support - truth).abs().mean()
     )
 
 
@@ -212,11 +209,8 @@ def validate_things(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
         figures = error.abs().mean(dim=1), body_loss(predicted.body, truth), error / predicted.deviation()
         parts.append([each.cpu().numpy() for each in figures])
     mean_error, body_error, ratio = map(np.concatenate, zip(*parts, strict=True))
-    found: dict[str, Any] = {
-        "error": float(mean_error.mean()),
-        "body": float(body_error.mean()),
-        "ratio": float(ratio.std()),
-    }
+    means = {"error": mean_error.mean(), "body": body_error.mean(), "ratio": ratio.std()}
+    found: dict[str, Any] = {name: float(mean) for name, mean in means.items()}
     for k, kind in enumerate(KINDS):
         mine = views.kinds == k
         if mine.any():

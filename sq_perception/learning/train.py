@@ -23,7 +23,7 @@ from sq_perception.learning.dataset import POOL, Disturbance, ViewPool, ViewSour
 from sq_perception.learning.inference import check_device
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.networks import Regressor, RegressorConfig
-from sq_perception.learning.training import Course, Stopped, TrainingState, run, settings_before, threads
+from sq_perception.learning.training import Course, Stopped, TrainingState, read_settings, run, threads
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 
 __all__ = ["Stopped", "recalibrate", "train", "validate"]
@@ -62,7 +62,7 @@ def train(
                 f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
                 "one number has no deviation to normalise by"
             )
-        before = settings_before(output / "state.safetensors")
+        before = read_settings(output / "state.safetensors")
         state = TrainingState.begin(model, config, output, _OF_A_RUN)
         if any(before.get(name, getattr(config, name)) != getattr(config, name) for name in _VALIDATED):
             state.best, state.plateau = -math.inf, Plateau()  # what was best was so of other views
@@ -116,12 +116,8 @@ def _course(config: TrainingConfig, state: TrainingState, device: torch.device) 
 def validate(
     model: Regressor, views: np.ndarray, truth: Superquadric, objective: Objective | None = None
 ) -> np.ndarray:
-    """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames.
-
-    With an ``objective`` for which some parameters are given, those are taken from the truth.
-    """
-    at_once = 250  # views of a validation that are computed at once
-    flats = [model.predict(views[i : i + at_once]).to_flat() for i in range(0, len(views), at_once)]
+    """Volume IoU (n,) of the network's bodies, with what the ``objective`` gives of the truth, and the true ones."""
+    flats = [model.predict(views[i : i + 250]).to_flat() for i in range(0, len(views), 250)]
     prediction = Superquadric.from_flat(np.concatenate(flats))
     return volume_iou(objective.with_given(prediction, truth) if objective else prediction, truth)
 

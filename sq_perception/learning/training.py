@@ -95,7 +95,7 @@ class TrainingState:
         Raises CheckpointError also where that one differs in a setting of ``form``.
         """
         path, device = output / "state.safetensors", next(model.parameters()).device
-        before = settings_before(path)
+        before = read_settings(path)
         other = [name for name in form if before.get(name, getattr(config, name)) != getattr(config, name)]
         if other:
             differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
@@ -182,7 +182,7 @@ class TrainingState:
         self.step += 1
 
 
-def settings_before(state: Path) -> dict[str, Any]:
+def read_settings(state: Path) -> dict[str, Any]:
     """What the run of a state was made of, empty where that is not known; CheckpointError where it is not readable."""
     try:
         return dict(json.loads(checkpoint.read_header(state).get("training", "{}")))
@@ -268,8 +268,7 @@ def _keep(state: TrainingState, config: Run, course: Course, record: dict[str, A
 def mixed_precision(device: str, wanted: bool) -> torch.autocast:
     """Within it a network computes in bfloat16, where that is wanted and the device has such products.
 
-    A processor without them takes 16 times as long for a step in bfloat16 as in float32; one with them is twice
-    as fast.
+    A processor without them takes 16 times as long for a step in it as in float32, one with them half as long.
     """
     has_products = device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     return torch.autocast(device, torch.bfloat16, enabled=wanted and has_products)

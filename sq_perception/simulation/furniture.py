@@ -189,12 +189,12 @@ def add_room(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
         return scene.depth
     chosen = rng.integers(free[0].size, size=int(rng.integers(1, 11)))
     feet = camera.unproject(free[1][chosen], free[0][chosen], ground[free][chosen])
-    standing = Superquadric.stack([_standing_at(foot, edge, away, scene.table, rng) for foot in feet])
+    standing = Superquadric.stack([_stand_behind_table(foot, edge, away, scene.table, rng) for foot in feet])
     seen = np.minimum(np.minimum(ground, raycast.render(standing, camera)[0]), scene.wall)
     return np.where((scene.labels > 0) | on_table, scene.depth, seen)
 
 
-def _standing_at(
+def _stand_behind_table(
     foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
 ) -> Superquadric:
     """Return a body on the floor below a point, moved from the table if it would reach under its top."""

@@ -37,24 +37,19 @@ from sq_perception.simulation.thing import (
     Thing,
     about,
     assemble,
+    draw_index,
     log_uniform,
-    one_of,
     part,
 )
 
-KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
-
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
-    """Draw a random object, of one of the given kinds or of any.
-
-    Raises ValueError if a kind is unknown or none is given.
-    """
+    """Draw a random object, of one of the given kinds or of any; a ValueError if one is unknown or none is given."""
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, got {names}")
-    _, makers = _MAKERS[names[one_of([_MAKERS[name][0] for name in names], rng)]]
-    return makers[one_of([likely for _, likely in makers], rng)][0](rng)
+    _, makers = _MAKERS[names[draw_index([_MAKERS[name][0] for name in names], rng)]]
+    return makers[draw_index([likely for _, likely in makers], rng)][0](rng)
 
 
 def _carton(rng: np.random.Generator) -> Thing:
@@ -256,3 +251,4 @@ _MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thin
     "soft": (0.04, ((_bag, 1.0),)),
 }
 """Default frequency of each kind, and its families with their frequencies."""
+KINDS = tuple(_MAKERS)

@@ -102,9 +102,7 @@ class Mesh:
 
 
 def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
-    """Render the depth (height, width) of a mesh in the optical frame; +inf for no surface.
-
-    Faces are seen from both sides.
+    """Render the depth (height, width) of a mesh in the optical frame, seen from both sides; +inf for no surface.
 
     Raises ValueError for another camera than a pinhole one, or a mesh that is not wholly in front of it.
     """

@@ -34,8 +34,9 @@ from sq_perception.imaging.raycast import render
 
 THESIS_SIZE = (25 / 255, 75 / 255)
 TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-MAX_TABLE_BODIES, MOST = 10, 12
-"""Most bodies of a scene and of a crowd."""
+MOST = 12
+"""Most bodies of a crowd."""
+
 
 @dataclass(frozen=True)
 class Scene:
@@ -74,8 +75,8 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
     Raises ValueError if ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its
     image.
     """
-    if not 1 <= count <= MAX_TABLE_BODIES:
-        raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
+    if not 1 <= count <= 10:
+        raise ValueError(f"count: expected 1 to 10 bodies, got {count}")
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     # In one of seven views ten bodies do not fit.
@@ -168,7 +169,7 @@ def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAME
             drawn = resting_body(rng, plane, 0.25)[0]
             if not inside_image(drawn, camera):
                 continue
-            body = _Placed.of(drawn, rng)
+            body = _Placed(drawn, drawn.sample_surface(1500, rng, oversampling=2))
             if bodies and rng.random() < 0.7:
                 body = _push(body, bodies[rng.integers(len(bodies))], plane[:3])
             if not any(map(body.overlaps, bodies)) and inside_image(body.body, camera):
@@ -184,10 +185,6 @@ class _Placed:
 
     body: Superquadric
     surface: np.ndarray
-
-    @classmethod
-    def of(cls, body: Superquadric, rng: np.random.Generator) -> _Placed:
-        return cls(body, body.sample_surface(1500, rng, oversampling=2))
 
     def move(self, by: np.ndarray) -> _Placed:
         return _Placed(self.body.transformed(np.array([0.0, 0.0, 0.0, 1.0]), by), self.surface + by)

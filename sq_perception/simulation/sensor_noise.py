@@ -339,53 +339,37 @@ def _average(rng: np.random.Generator, shape: tuple[int, ...], window: tuple[int
 
 IDEAL = "ideal"
 """Name of the sensor with Gaussian noise and nothing else, whose noise the user chooses."""
-KINECT_V1 = StructuredLight(
-    focal=580.0, baseline=0.075, step=1 / 8, window=(9, 5), near=0.5, far=5.0, edge_wander=0.8, grazing=70.0, blind=88.0
-)
-"""Kinect for Xbox 360, Xtion and their kin, in the infrared camera's own view.
-
-Noise and edges: Nguyen et al.  Steps and range: Khoshelham & Elberink (2.85 mm at 1 m, which is 1/8 pixel; 0.5 to 5 m).
-Window: autocorrelation of plane residuals in the recorded mOSD frames.  Angles of loss are chosen, not measured.
-"""
-
-AZURE_KINECT = TimeOfFlight(near=0.5, far=3.86, footprint=2.0, mixed_loss=0.5)
-"""Azure Kinect, narrow field of view, unbinned.
-
-Range: Microsoft's specification.  Noise: that of the Kinect v2 (Fankhauser et al.), as Kurillo et al. found both
-comparable up to 2.5 m; Microsoft's specification is at most 17 mm.  Footprint and loss at edges are chosen.
-"""
-
-REALSENSE_D435 = Stereo(
-    focal=424.0, baseline=0.05, step=1 / 32, window=(11, 5), near=0.17, far=10.0, edge_wander=1.0, grazing=75.0,
-    blind=88.0, subpixel=0.08, fattening=2,
-)  # fmt: skip
-"""RealSense D435 at 848 x 480.
-
-Intel: field of view 90 degrees (f = 424), baseline 50 mm, disparities in steps of 1/32 pixel, nearest 0.17 m and
-farthest 10 m; Grunnet-Jepsen (librealsense issue 3904): use a subpixel RMS of 0.08.  Window: autocorrelation of plane
-residuals in recorded RealSense frames, scaled to f = 424.  Edges and angles of loss are chosen.
-"""
-
-ZED = Stereo(
-    focal=700.0, baseline=0.12, step=0.0, window=(9, 9), near=0.3, far=20.0, edge_wander=1.0, grazing=75.0,
-    blind=88.0, subpixel=0.25, fattening=3,
-)  # fmt: skip
-"""ZED at 1280 x 720, a passive stereo camera.
-
-Stereolabs: baseline 120 mm, 0.3 to 20 m, depth as floating numbers.  Subpixel: 3 sigma of a quarter of a pixel are the
-accuracy of 1 % at 1 m that is quoted for it.  The rest is chosen.  Holes where texture is missing are left out.
-"""
-
 PRESETS: Mapping[str, SensorNoise] = {
-    "kinect_v1": KINECT_V1, "azure_kinect": AZURE_KINECT, "realsense_d435": REALSENSE_D435, "zed": ZED
-}
+    # Kinect for Xbox 360, Xtion and their kin, in the infrared camera's own view.  Noise and edges: Nguyen et al.
+    # Steps and range: Khoshelham & Elberink (2.85 mm at 1 m, which is 1/8 pixel; 0.5 to 5 m).  Window: autocorrelation
+    # of plane residuals in the recorded mOSD frames.  Angles of loss are chosen, not measured.
+    "kinect_v1": StructuredLight(
+        focal=580.0, baseline=0.075, step=1 / 8, window=(9, 5), near=0.5, far=5.0, edge_wander=0.8, grazing=70.0,
+        blind=88.0,
+    ),
+    # Narrow field of view, unbinned.  Range: Microsoft's specification.  Noise: that of the Kinect v2 (Fankhauser et
+    # al.), as Kurillo et al. found both comparable up to 2.5 m; Microsoft's specification is at most 17 mm.  Footprint
+    # and loss at edges are chosen.
+    "azure_kinect": TimeOfFlight(near=0.5, far=3.86, footprint=2.0, mixed_loss=0.5),
+    # At 848 x 480.  Intel: field of view 90 degrees (f = 424), baseline 50 mm, disparities in steps of 1/32 pixel,
+    # nearest 0.17 m and farthest 10 m; Grunnet-Jepsen (librealsense issue 3904): use a subpixel RMS of 0.08.  Window:
+    # autocorrelation of plane residuals in recorded frames, scaled to f = 424.  Edges and angles of loss are chosen.
+    "realsense_d435": Stereo(
+        focal=424.0, baseline=0.05, step=1 / 32, window=(11, 5), near=0.17, far=10.0, edge_wander=1.0, grazing=75.0,
+        blind=88.0, subpixel=0.08, fattening=2,
+    ),
+    # A passive stereo camera at 1280 x 720.  Stereolabs: baseline 120 mm, 0.3 to 20 m, depth as floating numbers.
+    # Subpixel: 3 sigma of a quarter of a pixel are the accuracy of 1 % at 1 m that is quoted for it.  The rest is
+    # chosen.  Holes where texture is missing are left out.
+    "zed": Stereo(
+        focal=700.0, baseline=0.12, step=0.0, window=(9, 9), near=0.3, far=20.0, edge_wander=1.0, grazing=75.0,
+        blind=88.0, subpixel=0.25, fattening=3,
+    ),
+}  # fmt: skip
 
 
 def preset(name: str) -> SensorNoise:
-    """Return the sensor of this name.
-
-    Raises ValueError if there is none.
-    """
+    """Return the sensor of this name; a ValueError if there is none."""
     if name not in PRESETS:
         raise ValueError(f"sensor: expected one of {', '.join(PRESETS)}, got {name!r}")
     return PRESETS[name]

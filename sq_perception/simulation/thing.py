@@ -82,7 +82,7 @@ class Thing:
 
         ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them.
         """
-        rest = self.rests[one_of([rest.likely for rest in self.rests], rng)]
+        rest = self.rests[draw_index([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
         if rng.random() < leaning:
             tilt, way = rng.uniform(*np.deg2rad((4.0, 35.0))), rng.uniform(0, 2 * np.pi)
@@ -96,7 +96,7 @@ def _turn(x: float, y: float, z: float, angle: float) -> np.ndarray:
     return np.array([x * s, y * s, z * s, np.cos(angle / 2)])
 
 
-def one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
+def draw_index(weights: Sequence[float], rng: np.random.Generator) -> int:
     """Draw a random index with these weights."""
     return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
 

@@ -20,9 +20,6 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
-_BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
-_LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
-
 
 @dataclass(frozen=True, eq=False)
 class Setting:
@@ -116,7 +113,7 @@ def _camera_pose(
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
     aside, below = rng.uniform(-1, 1, 2) * (0.5, 0.4)
     ray = np.array([aside, below, 1.0])
-    look = looking_down(_pitch(ray, elevation, roll), roll)
+    look = optical_from_table(_pitch(ray, elevation, roll), roll)
     matrix = quaternions.to_matrix(look)
     near, usual, far = 0.35, 1.3, 2.0
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
@@ -129,7 +126,13 @@ def _camera_pose(
     return look, distance * ray / np.linalg.norm(ray) - matrix @ (lift + middle), distance
 
 
-def looking_down(pitch: float, roll: float) -> np.ndarray:
+def level_directions(count: int) -> np.ndarray:
+    """Return unit vectors (count, 3) all around, at right angles to z."""
+    bearings = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.stack([np.cos(bearings), np.sin(bearings), 0 * bearings], axis=1)
+
+
+def optical_from_table(pitch: float, roll: float) -> np.ndarray:
     """Return the optical from table quaternion: the axis ``pitch`` below the horizon, towards the table's y."""
     half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
     c, s = np.cos(half), np.sin(half)
@@ -172,11 +175,8 @@ def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndar
 def _with_neighbours(
     others: list[np.ndarray], parts: np.ndarray, floor: float, rng: np.random.Generator
 ) -> list[np.ndarray]:
-    """Add up to three parts (12,) beside the object, as seen from above, without penetration.
-
-    Many are between it and the camera, many touch it.
-    """
-    rows = list(others)
+    """Add up to three parts (12,) beside the object, many before it, many touching it, without penetration."""
+    rows, level = list(others), level_directions(32)
     for _ in range(rng.choice((0, 0, 0, 0, 1, 1, 1, 2, 2, 3))):
         size = np.exp(rng.uniform(np.log(0.02), np.log(0.1), 3))
         shape = rng.uniform(0.1, 1.0, 2) ** [1.0, 0.7]
@@ -189,7 +189,7 @@ def _with_neighbours(
         far = flat_support(parts, way[None])[0] + flat_support(row[None], -way[None])[0] + gap
         row[5:7] = far * way[:2] + rng.normal(0, 0.02) * np.array([-way[1], way[0]])
         # One of some vertical planes parts it from each of the others.
-        reach = flat_support(row[None], _LEVEL)
-        if all((reach + flat_support(other[None], -_LEVEL) <= 0).any() for other in rows):
+        reach = flat_support(row[None], level)
+        if all((reach + flat_support(other[None], -level) <= 0).any() for other in rows):
             rows.append(row)
     return rows

@@ -93,13 +93,13 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         # above its plane, and a network that often sees that expects it of objects whose lower end is hidden.
         below = setting.under if rng.random() < 2 / 3 else setting.table
         if below is not None and rng.random() < 0.8:
-            plane = _imprecise(below, setting.parts.translation.mean(axis=0), rng)
+            plane = _disturb_plane(below, setting.parts.translation.mean(axis=0), rng)
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         mask = _mask(measured, seen, camera, setting.table if plane is None else plane, rng)
         # Of household objects that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation.
         if rng.random() < 0.08:
-            mask = _partly(mask, rng)
+            mask = _cut_off(mask, rng)
         # Masks from depth end where nothing was measured, those from colour do not.
         if rng.random() >= 0.5:
             mask = mask & np.isfinite(measured)
@@ -128,7 +128,7 @@ def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tupl
         near, whose = setting.view_from(place, sensor).render()
         measured = measure_by_any(near, whose, sensor, stages, rng) if whose.any() else near
         return align(measured, sensor, place, camera, stages.whole), seen, camera
-    depth, seen = _something_before(depth, seen, rng)
+    depth, seen = _add_occluder(depth, seen, rng)
     if stages.decimation > 1:
         half = slice(stages.decimation // 2, None, stages.decimation)
         kept = decimate_camera(camera, stages.decimation)
@@ -138,7 +138,7 @@ def _measure(setting: Setting, stages: Stages, rng: np.random.Generator) -> tupl
     return measure_by_any(depth, seen, camera, stages, rng) if seen.any() else depth, seen, camera
 
 
-def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+def _add_occluder(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return image and mask, some with an occluder from one side: a straight edge, a corner or a round object."""
     if rng.random() > 0.25 or not seen.any():
         return depth, seen
@@ -157,7 +157,7 @@ def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Genera
     return np.where(before, np.minimum(near, depth), depth), seen & ~before
 
 
-def _imprecise(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _disturb_plane(plane: np.ndarray, at: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return the plane as it would be found: tilted about the point below ``at`` and shifted."""
     normal = plane[:3] + np.deg2rad(0.7) * rng.standard_normal(3)
     normal /= np.linalg.norm(normal)
@@ -190,7 +190,7 @@ def _mask(
     return coherent(measured, inner, shown_step(footprint))
 
 
-def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _cut_off(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Remove from the mask what lies beyond a straight line."""
     v, u = np.nonzero(mask)
     if not v.size:
@@ -269,7 +269,7 @@ def measure_by_any(
         measured[seen & _blob(seen, rng)] = np.nan
     # Of household objects that are half visible, 4 % are measured at less than half of their pixels.
     if rng.random() < 0.08:
-        measured[seen & _between_patches(seen, rng)] = np.nan
+        measured[seen & _all_but_patches(seen, rng)] = np.nan
     if rng.random() < 0.3:
         measured = _smooth(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
     if rng.random() < 0.5:
@@ -326,7 +326,7 @@ def _blob(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.square(x / long) + np.square(y / wide) < 1
 
 
-def _between_patches(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+def _all_but_patches(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Select most of an object that is shiny, dark or translucent."""
     coarse = rng.standard_normal((int(rng.integers(3, 12)), int(rng.integers(3, 12))), dtype=np.float32)
     field = cv2.resize(coarse, (seen.shape[1], seen.shape[0]), interpolation=cv2.INTER_CUBIC)

@@ -30,7 +30,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing import SIX_WAYS, Thing
-from sq_perception.simulation.thing_setting import looking_down
+from sq_perception.simulation.thing_setting import level_directions, optical_from_table
 
 MOST_THINGS = 8
 TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
@@ -40,12 +40,11 @@ ELEVATION = (20.0, 70.0)
 """Degrees."""
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many an object can neither lean nor be stacked where it is tried."""
-_UP, _DOWN = 128, 129
-"""The last of the directions that follow; of those before, opposite ones are half as far apart."""
-_BEARINGS = np.linspace(0, 2 * np.pi, _UP, endpoint=False)
-_QUARTER = _UP // 4
-_WAYS = np.concatenate([np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1), SIX_WAYS[[2, 5]]])
+_UP = 128
+_WAYS = np.concatenate([level_directions(_UP), SIX_WAYS[[2, 5]]])
+"""Directions: level ones, and from the index ``_UP`` on up and down."""
 _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
+"""The index of the direction opposite to each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,11 +127,11 @@ def things_on_table(
     wanted = int(rng.integers(1, MOST_THINGS + 1)) if count is None else count
     roll = float(np.deg2rad(5.0))
     for _ in range(15):
-        look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-roll, roll))
+        look = optical_from_table(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-roll, roll))
         eye = np.array([0.0, 0.0, rng.uniform(0.5, 1.2)])
         resting = _arrange(wanted, look, eye, camera, rng, kinds)
         if resting is not None:
-            return _seen(resting, look, eye, camera, rng)
+            return _render(resting, look, eye, camera, rng)
     raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
 
 
@@ -169,19 +168,19 @@ def _draw(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np
     flat_top = thing.kind == "box" or (thing.kind == "can" and rest == "standing" and len(thing.parts) == 1)
     turned = move(thing.parts.to_flat(), turn, np.zeros(3))
     body = _Resting(thing, rest, turn, np.zeros(3), flat_support(turned, _WAYS), flat_top and how != "leaning")
-    floor = body.reach[_DOWN]
+    floor = body.reach[_BACK[_UP]]
     if how == "apart":
         return body.at(np.array([*(rng.normal(0, spread, 2)), floor]))
     able = [other for other in others if other.carries] if how == "stacked" else others
     if not able:
         return None
     other = able[rng.integers(len(able))]
-    middle = 0.5 * (other.reach - other.reach[_BACK]) @ _WAYS / (_UP / 2)
+    middle = (other.reach - other.reach[_BACK]) @ _WAYS / _UP
     if how == "stacked":
-        face = 0.5 * (other.reach[: 2 * _QUARTER : _QUARTER] + other.reach[2 * _QUARTER : _UP : _QUARTER])
+        face = 0.5 * (other.reach + other.reach[_BACK])[: _UP // 2 : _UP // 4]
         at = middle[:2] + rng.uniform(-0.25, 0.25, 2) * face.min()
         return replace(body.at(np.array([*at, other.reach[_UP] + floor])), rest=f"stacked, {rest}")
-    if other.reach[_DOWN] < -1e-3:  # itself not on the table
+    if other.reach[_BACK[_UP]] < -1e-3:  # itself not on the table
         return None
     reach = flat_support(turned, way[None])[0]
     where = flat_support(move(other.thing.parts.to_flat(), other.turn, other.shift), -way[None])[0]
@@ -209,7 +208,7 @@ def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) 
     return bool((pixels > margin).all() and (pixels < limit).all())
 
 
-def _seen(
+def _render(
     resting: list[_Resting], look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> ThingsOnTable:
     table = quaternions.to_matrix(look)

@@ -113,7 +113,7 @@ def _render_view(
     rounds, curtain = 4, (anchor[0], anchor[1], side, np.inf)
     if is_occluded:
         _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
-        curtain = (anchor[0], anchor[1], side, _begins(surface, reach, front[5]))
+        curtain = (anchor[0], anchor[1], side, _front_start(surface, reach, front[5]))
         rounds -= 1
     while True:
         _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
@@ -124,7 +124,8 @@ def _render_view(
         outliers = int(len(seen) * OUTLIERS_PER_END)
         anchor[2] = seen[len(seen) - 1 - outliers]
         extent = anchor[2] - seen[outliers]
-        top, bottom, left, right = _limits(surface)
+        rows, columns = np.nonzero(surface > _NOTHING)
+        top, bottom, left, right = rows.min(), rows.max(), columns.min(), columns.max()
         extent = max(extent, max(bottom - top, right - left) * side / pixels if is_fitted else side / MARGIN)
         done = abs(extent * MARGIN - side) <= (0.005 + 1.5 * is_fitted / pixels) * side
         if done and not is_missed:
@@ -186,14 +187,7 @@ def _cast(
 
 
 @kernel
-def _limits(surface: np.ndarray) -> tuple[int, int, int, int]:
-    """Return first and last row, first and last column with a visible point."""
-    rows, columns = np.nonzero(surface > _NOTHING)
-    return int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())
-
-
-@kernel
-def _begins(surface: np.ndarray, reach: np.ndarray, share: float) -> float:
+def _front_start(surface: np.ndarray, reach: np.ndarray, share: float) -> float:
     """Return where an occluder begins in its direction, so that this share of the visible part lies beyond."""
     seen = np.sort(reach.ravel()[surface.ravel() > _NOTHING])
     return seen[int((1.0 - share) * (len(seen) - 1))] if len(seen) else np.inf

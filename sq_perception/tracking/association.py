@@ -35,8 +35,9 @@ yz has become xy, and the other two share one exponent:
     e2' = e1,    e1' = (e1 + e2) / 2,
 
 wrong by (e1 - e2) / 2 in each of them.  A box whose exponents differ by less than the noise is fitted now with one axis
-as z and now with another.  So an exchange is a candidate too where |e1 - e2| < EXCHANGE, with the variance (e1 - e2)^2
-added to both exponents.  The candidate of greatest likelihood is taken: least d^2 + log det S.
+as z and now with another.  So an exchange is a candidate too where |e1 - e2| < 1/2, with the variance (e1 - e2)^2
+added to both exponents: exponents of fitted boxes and ovals differ by less, those of cylinders by more.  The candidate
+of greatest likelihood is taken: least d^2 + log det S.
 """
 
 from __future__ import annotations
@@ -225,13 +226,9 @@ def compare(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement
     return Agreement((excess <= 1) & ~slid & ~turned, ~is_outside(SIZE_AND_SHAPE), slid, turned, np.maximum(excess, 1))
 
 
-def same_side(before: np.ndarray, now: np.ndarray) -> bool:
+def is_same_side(before: np.ndarray, now: np.ndarray) -> bool:
     """Whether two vectors are less than 60 degrees apart; False for zero."""
     return bool(before @ now > 0.5 * np.linalg.norm(before) * np.linalg.norm(now))
-
-
-EXCHANGE = 0.5
-"""Chosen: the exponents of fitted boxes and ovals differ by less, those of cylinders by more."""
 
 
 def _rotations() -> np.ndarray:
@@ -266,13 +263,10 @@ def candidates(observed: np.ndarray) -> np.ndarray:
 def nearest_form(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The form of each of n observations (n, 12) that continues its track (n, 12), and its covariance (n, 11, 11).
-
-    ``track_covariance`` and ``covariance`` are (n, 11, 11), world frame.
-    """
+    """The form of each of n observations (n, 12) that continues its track (n, 12), and its covariance (n, 11, 11)."""
     each = np.arange(len(track))
     unlike = np.abs(observed[:, 3] - observed[:, 4])
-    is_box = unlike < EXCHANGE
+    is_box = unlike < 0.5
     count = len(TURNS) if is_box.any() else EXACT
     forms = candidates(observed)[:, :count]
     changed = _CHANGES[:count] @ covariance[:, None] @ _CHANGES[:count].swapaxes(-1, -2)

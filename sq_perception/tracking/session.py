@@ -36,8 +36,6 @@ from sq_perception.tracking.state import LENGTH, Observed
 from sq_perception.tracking.tracker import Track, Tracker
 
 FIRST_FAILED_ID = 2**31
-_LOOKS_IN = 0.2
-"""Cosine between a cavity's axis and the way to the camera from which on it is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,16 +126,16 @@ class TrackingSession:
         by_index = {track.observation: track for track in tracks}
         here = [by_index[index] for index in range(len(observed))]
         bodies = [track.superquadric.transformed(back, -matrix @ position) for track in here]
-        outgrown = _outgrown(bodies, observed)
+        outgrown = _exceed_tracks(bodies, observed)
         found = []
         for track, body, observation, is_outgrown in zip(here, bodies, observed, outgrown, strict=True):
             covariance = state.rotate(track.covariance, matrix)
             is_fused = is_pose_known and track.follows and not is_outgrown
             if not is_fused:
-                body, covariance = _in_form_of(body, covariance, observation)
+                body, covariance = _rename_axes(body, covariance, observation)
             elif not np.isfinite(observation.covariance).all():
                 covariance = np.full((LENGTH, LENGTH), np.nan)
-            body = _taper_like(body, observation.superquadric)
+            body = _add_taper(body, observation.superquadric)
             cavity = self._keep_cavity(track.id, body, getattr(observation, "cavity", None))
             found.append(Followed(track.id, track.seen, is_fused, body, covariance, cavity))
         self._cavities = {track.id: self._cavities[track.id] for track in tracks if track.id in self._cavities}
@@ -153,7 +151,7 @@ class TrackingSession:
             return None
         known = self._cavities[number]
         known = replace(known, rim=place + turn @ known.rim, axis=turn @ known.axis)
-        if -(known.axis @ known.rim) > _LOOKS_IN * np.linalg.norm(known.rim):
+        if -(known.axis @ known.rim) > 0.2 * np.linalg.norm(known.rim):  # the camera looks into it
             del self._cavities[number]  # it was closed
             return None
         return known
@@ -166,7 +164,7 @@ class TrackingSession:
         return self._tracker
 
 
-def _taper_like(body: Superquadric, observed: Superquadric) -> Superquadric:
+def _add_taper(body: Superquadric, observed: Superquadric) -> Superquadric:
     """An untapered body in the box of the observed one, with its taper where both have the same z axis."""
     turn = np.round(body.rotation_matrix.T @ observed.rotation_matrix)
     if not observed.is_tapered or abs(turn[2, 2]) != 1:
@@ -174,7 +172,7 @@ def _taper_like(body: Superquadric, observed: Superquadric) -> Superquadric:
     return body.with_taper(turn[2, 2] * np.abs(turn[:2, :2]) @ observed.taper)
 
 
-def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.ndarray:
+def _exceed_tracks(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.ndarray:
     """Which observations (n,) have points that span more, along their axes, than their track's body in this frame."""
     if not bodies:
         return np.zeros(0, bool)
@@ -187,7 +185,7 @@ def _outgrown(bodies: list[Superquadric], observed: Sequence[Observed]) -> np.nd
     return np.asarray((spanned > 1.2 * wide).any(axis=-1))
 
 
-def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
+def _rename_axes(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
     """The observed body and its covariance, in that of its forms which continues ``body`` with ``covariance``."""
     own = np.asarray(observation.covariance, dtype=float)
     known = np.isfinite(own).all()

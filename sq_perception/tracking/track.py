@@ -89,8 +89,6 @@ class Body:
     jumps: int = 0  # observations in a row that were found elsewhere
     observation: int | None = None  # as in :class:`Track`, and so are id, velocity and seen
     follows: bool = True  # whether the state is as the last observation has it
-    answer: np.ndarray | None = None
-    """(12,), the last observation, if it is an old answer that shows no more than that the body is still there."""
     at_rest: np.ndarray | None = None  # its covariance if it has not moved, while it may be anywhere within reach
 
     @property
@@ -117,17 +115,15 @@ class Body:
             variance[POSE] += np.maximum(HAND**2 - np.diag(estimate.covariance)[POSE], 0.0)
         return replace(
             self, estimate=estimate._replace(state=state, covariance=estimate.covariance + np.diag(variance)),
-            velocity=velocity, observation=None, answer=self.answer if self.observation is not None else None,
-            at_rest=at_rest,
+            velocity=velocity, observation=None, at_rest=at_rest,
         )
 
-    def see_again(self, index: int, answer: np.ndarray, stamp: float) -> Body:
+    def see_again(self, index: int, stamp: float) -> Body:
         """The body after an old answer, the observation of this index."""
         agreed = stamp if self.follows else self.agreed
         estimate = self.estimate if self.at_rest is None else self.estimate._replace(covariance=self.at_rest)
         return replace(
-            self, estimate=estimate, seen=self.seen + 1, missed=0, last=stamp, agreed=agreed, observation=index,
-            answer=answer,
+            self, estimate=estimate, seen=self.seen + 1, missed=0, last=stamp, agreed=agreed, observation=index
         )
 
     def publish(self) -> Track:

@@ -42,9 +42,6 @@ PREDICTED_SHARE = 0.6
 degrees about them, 90 instead of 84 % of the half sizes are within two deviations, of single frames 93 %."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
-UNKNOWN = 0.15, 0.2, 0.15, 0.2
-"""Deviations (sizes as shares, exponents, centre as a share of the mean half size, turn) of observations without
-covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
 FORGET_AFTER = 30.0
@@ -134,34 +131,29 @@ class Tracker:
             depth = camera.readings(depth)
         rotation, position = state.parse_pose(camera_pose)
         orthographic = camera is not None and not camera.is_pinhole
-        frame = _in_world(recoveries, stamp, rotation, position, orthographic)
+        frame = _to_world(recoveries, stamp, rotation, position, orthographic)
 
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
         bodies = tuple(body.predict(elapsed, stamp) for body in self._bodies)
-        repeated = _repeat(bodies, frame) if frame.repeats.all() else None
-        here = _pairs_in_place(bodies, frame) if repeated is None else Pairs.none()
-        missing = np.array([body.observation is None for body in repeated or bodies], dtype=bool)
+        states, covariances = stack(bodies)
+        here = association.pairs_in_place(states, covariances + _least(states), frame.state, frame.covariance)
+        missing = np.ones(len(bodies), dtype=bool)
         missing[here.track] = False
-        unseen = stack([body for body, is_unseen in zip(bodies, missing, strict=True) if is_unseen])[0]
-        missing[missing] = visibility.is_missing(unseen, camera, depth, rotation, position)
-        new = np.zeros(0, dtype=int)
-        if repeated is not None:
-            bodies = repeated
-        else:
-            there = _pairs_elsewhere(bodies, frame, here, missing)
-            bodies, pairs = _count_jumps(bodies, here, there), here + there
-            bodies, pairs_left = _see_again(bodies, pairs, frame)
-            bodies = _fuse(bodies, pairs_left, frame)
-            new = np.delete(np.arange(len(recoveries)), pairs.observed)
+        missing[missing] = visibility.is_missing(states[missing], camera, depth, rotation, position)
+        there = _pairs_elsewhere(bodies, frame, here, missing)
+        pairs = here + there
+        bodies, pairs_left = _see_again(_count_jumps(bodies, here, there), pairs, frame)
+        bodies = _fuse(bodies, pairs_left, frame)
+        new = np.delete(np.arange(len(recoveries)), pairs.observed)
         bodies += tuple(_birth(self.births + n, int(k), frame) for n, k in enumerate(new, 1))
         missing = np.append(missing, np.zeros(len(new), dtype=bool))
         self._bodies, self._stamp, self.births = _survivors(bodies, missing, stamp), stamp, self.births + len(new)
         return tuple(body.publish() for body in self._bodies)
 
 
-def _in_world(
+def _to_world(
     recoveries: Sequence[Observed], stamp: float, rotation: np.ndarray, position: np.ndarray, orthographic: bool
 ) -> _Frame:
     for body in recoveries:
@@ -171,9 +163,9 @@ def _in_world(
             raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(body.covariance)}")
     flat = np.array([body.superquadric.untapered().to_flat() for body in recoveries], dtype=float).reshape(-1, 12)
     covariance = np.array([body.covariance for body in recoveries], dtype=float).reshape(-1, LENGTH, LENGTH)
-    size, shape, centre, turn = UNKNOWN
     for k in np.flatnonzero(~np.isfinite(covariance).all(axis=(1, 2))):
-        shares = state.diagonal(size, shape, centre * float(flat[k, 0:3].mean()), turn)
+        # Chosen: errors of the classic fit and of the network alone on household things are of this order.
+        shares = state.diagonal(0.15, 0.2, 0.15 * float(flat[k, 0:3].mean()), 0.2)
         covariance[k] = state.scale_sizes(shares, flat[k, 0:3])
     matrix = quaternions.to_matrix(rotation)
     flat[:, 5:8] = flat[:, 5:8] @ matrix.T + position
@@ -184,26 +176,6 @@ def _in_world(
         visibility.directions(flat[:, 5:8], rotation, position, orthographic),
         np.array([body.repeats > 0 for body in recoveries], dtype=bool),
     )
-
-
-def _repeat(bodies: _Bodies, frame: _Frame) -> _Bodies | None:
-    """The bodies after a frame whose observations are all equal, to the bit, to those of the frame before; else None.
-
-    Nothing else is compared then: a table at which nothing happens costs next to nothing.
-    """
-    by_answer = {body.answer.tobytes(): k for k, body in enumerate(bodies) if body.answer is not None}
-    tracks = [by_answer.get(each.tobytes(), -1) for each in frame.state]
-    if not tracks or min(tracks) < 0 or len(set(tracks)) < len(tracks):
-        return None
-    after = list(bodies)
-    for index, k in enumerate(tracks):
-        after[k] = after[k].see_again(index, frame.state[index], frame.stamp)
-    return tuple(after)
-
-
-def _pairs_in_place(bodies: _Bodies, frame: _Frame) -> Pairs:
-    states, covariances = stack(bodies)
-    return association.pairs_in_place(states, covariances + _least(states), frame.state, frame.covariance)
 
 
 def _pairs_elsewhere(bodies: _Bodies, frame: _Frame, here: Pairs, missing: np.ndarray) -> Pairs:
@@ -246,7 +218,7 @@ def _see_again(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> tuple[_Bodies, P
     is_old = frame.repeats[pairs.observed] & agrees & rests
     after, old = list(bodies), pairs.at(is_old)
     for k, index in zip(old.track, old.observed, strict=True):
-        after[k] = after[k].see_again(int(index), frame.state[index], frame.stamp)
+        after[k] = after[k].see_again(int(index), frame.stamp)
     return tuple(after), pairs.at(~is_old)
 
 
@@ -271,7 +243,7 @@ def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
         insists = body.disagreed >= PATIENCE and not rest.fits[k]
         after[pairs.track[k]] = replace(
             body, estimate=estimate.at(k), seen=body.seen + 1, missed=0, last=frame.stamp,
-            observation=int(pairs.observed[k]), follows=not (rest.slid[k] or rest.turned[k] or insists), answer=None,
+            observation=int(pairs.observed[k]), follows=not (rest.slid[k] or rest.turned[k] or insists),
         )
     return tuple(after)
 
@@ -293,8 +265,8 @@ def _doubt(
         is_out_of_patience = disagreed > 0 and (body.is_moving or disagreed >= PATIENCE)
         if not body.is_moving and body.jumps == 0:
             # What moves errs to the same side again; errors larger than their covariance do so seldom.
-            slid = slid and association.same_side(body.last_error[CENTRE], error[k, CENTRE])
-            turned = turned and association.same_side(body.last_error[TURN], error[k, TURN])
+            slid = slid and association.is_same_side(body.last_error[CENTRE], error[k, CENTRE])
+            turned = turned and association.is_same_side(body.last_error[TURN], error[k, TURN])
         if is_out_of_patience and verdict.fits[k] and (slid or turned):
             turning[k] = turned
             for part, has_moved in ((CENTRE, slid), (TURN, turned)):

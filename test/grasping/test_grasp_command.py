@@ -13,7 +13,7 @@ from sq_perception.commands import grasp_run, main
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import render_things
-from sq_perception.simulation.thing_setting import looking_down
+from sq_perception.simulation.thing_setting import optical_from_table
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 EYE = np.array([0.0, 0.0, 0.6])
@@ -22,7 +22,7 @@ EYE = np.array([0.0, 0.0, 0.6])
 @pytest.fixture
 def frame(tmp_path):
     """A can of 6 x 10 cm on a table, 45 degrees from above."""
-    look = looking_down(np.pi / 4, 0.0)
+    look = optical_from_table(np.pi / 4, 0.0)
     can = Superquadric([[0.03, 0.03, 0.05]], [[0.1, 1.0]], [[0.0, 0.0, 0.05]], [[0.0, 0.0, 0.0, 1.0]])
     can = can.transformed(look, EYE)
     up = can.rotation_matrix[0][:, 2]

@@ -19,6 +19,7 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 ON_TABLE = Surroundings(plane=TABLE)
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 SPHERE = ([0.03, 0.03, 0.03], [1.0, 1.0])
@@ -126,8 +127,7 @@ def test_what_lies_behind_the_support_has_that_for_a_reason():
     """Also where it is too wide; what looks out of the plane only in part is in the table's way."""
     sunk = Superquadric(*CAN, [0.5, 0.0, -0.055], UPRIGHT)
     behind, wide = (
-        Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT),
-        Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT),
+        Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT), Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT),
     )
     reasons = plan(behind, wide, sunk, standing(*CAN, y=0.5)).reasons
     assert reasons[:2] == ("behind the plane that bodies stand on",) * 2
@@ -313,13 +313,12 @@ def test_a_bodys_own_points_say_nothing_new():
 
 
 def test_space_that_nobody_saw_makes_a_grasp_less_sure():
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     body = Superquadric(*SPHERE, [0.0, 0.0, 0.6], UPRIGHT)
     free = plan(body, around=Surroundings()).grasps[0].score
     seen = np.full((48, 64), 1.0)
-    assert plan(body, around=Surroundings(depth=seen, camera=camera)).grasps[0].score >= free
+    assert plan(body, around=Surroundings(depth=seen, camera=CAMERA)).grasps[0].score >= free
     hidden = np.full((48, 64), 0.5)
-    assert plan(body, around=Surroundings(depth=hidden, camera=camera)).grasps[0].score < 0.95 * free
+    assert plan(body, around=Surroundings(depth=hidden, camera=CAMERA)).grasps[0].score < 0.95 * free
 
 
 def test_a_vague_side_is_where_the_image_shows_it():
@@ -337,10 +336,9 @@ def test_a_vague_side_is_where_the_image_shows_it():
 
 
 def test_places_are_hidden_that_the_image_does_not_show_to_be_empty():
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     depth = np.full((48, 64), 1.0)
     depth[:, :32] = np.nan
-    around = Surroundings(depth=depth, camera=camera)
+    around = Surroundings(depth=depth, camera=CAMERA)
     before, behind, dark, outside = [0.1, 0.0, 0.9], [0.1, 0.0, 1.1], [-0.1, 0.0, 0.9], [0.9, 0.0, 0.9]
     np.testing.assert_allclose(
         around.hidden_share(np.array([[before, before], [before, behind], [dark, outside]])), [0, 0.5, 1]
@@ -350,10 +348,9 @@ def test_places_are_hidden_that_the_image_does_not_show_to_be_empty():
 
 def test_gaps_between_readings_hide_nothing_and_are_no_points():
     """Depth registered to three times as many pixels a side."""
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
     row, column = np.indices((48, 64))
     depth = np.where((row % 3 == 0) & (column % 3 == 0), 1.0, np.nan)
-    around = Surroundings.of_image(depth, camera, None)
+    around = Surroundings.of_image(depth, CAMERA, None)
     places = np.array([[x, y, z] for x in (-0.31, -0.1, 0.2) for y in (-0.2, 0.11) for z in (0.9, 1.1)])
     np.testing.assert_allclose(around.hidden_share(places.reshape(2, -1, 3)), 0.5)
     np.testing.assert_allclose(around.beyond(places), 1.0 - places[:, 2])
@@ -362,8 +359,7 @@ def test_gaps_between_readings_hide_nothing_and_are_no_points():
 
 def test_a_doubtful_body_with_few_ways_is_planned_in_an_image_too():
     """All ways are looked at in the first round, so that none is left for the second."""
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-    around = Surroundings(depth=np.full((48, 64), 0.5), camera=camera)
+    around = Surroundings(depth=np.full((48, 64), 0.5), camera=CAMERA)
     body = Superquadric([0.038, 0.2, 0.2], [0.1, 0.1], [0.0, 0.0, 0.8], UPRIGHT)
     found = plan(body, around=around, covariance=sure(1, sigma=0.006)).grasps
     assert 0 < found[0].score < 0.5

@@ -11,11 +11,18 @@ from sq_perception.fitting import quality
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.raycast import render
 from sq_perception.tracking import association, state, track, tracker
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
 """A depth image in which nothing was measured."""
+
+
+def image_of(bodies, behind=1.5):
+    """The depth image of some bodies before a wall."""
+    depth, _ = render(bodies if isinstance(bodies, Superquadric) else Superquadric.stack(bodies), CAMERA)
+    return np.where(np.isfinite(depth), depth, behind)
 
 
 class Seen(NamedTuple):

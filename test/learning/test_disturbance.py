@@ -9,8 +9,7 @@ from sq_perception.geometry import Superquadric
 from sq_perception.imaging import canonical_view, raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN
-from sq_perception.learning.dataset import Disturbance, ViewSource, any_occluder, draw_views, wide_bodies
-from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.learning.dataset import Disturbance, ViewPool, ViewSource, any_occluder, draw_views, wide_bodies
 from sq_perception.simulation import view_rendering
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene, thesis_bodies
 
@@ -143,12 +142,11 @@ class TestWear:
         change = np.array([np.median(np.abs(w - v)[b]) for w, v, b in zip(worn, views, both, strict=True)])
         assert 0.5 < np.median(change) / (np.sqrt(0.03 / 2000) * 0.6745) < 2
 
-    @pytest.mark.parametrize(
-        "wrong", [{"occluded_share": 1.5}, {"noisy_share": -0.1}, {"pinhole_share": 2.0}, {"wide_share": -1.0}]
-    )
-    def test_misuse(self, wrong: dict[str, float]) -> None:
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            TrainingConfig(**wrong)
+
+def test_a_pool_pairs_views_with_their_bodies() -> None:
+    images, bodies = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32).batch(16)
+    again, _ = view_rendering.render_views(bodies, 32)
+    assert np.abs(again - images).mean() < 0.01
 
 
 def test_wide_bodies_have_the_proportions_they_say() -> None:

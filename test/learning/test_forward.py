@@ -94,6 +94,7 @@ def test_networks_of_masks(config: MaskConfig | None, rng: np.random.Generator) 
         with torch.inference_mode():
             expected = model.eval()(shown[some]).numpy()
         np.testing.assert_allclose(predictor.logits(views[some]), expected, atol=1e-4)
+    assert expected.shape == (1, pixels, pixels)
     assert expected.std() > 1e-3
 
 
@@ -136,9 +137,10 @@ def test_threads_do_not_share_what_they_compute_in(rng: np.random.Generator) -> 
 @pytest.mark.parametrize(
     "views", [np.zeros((64, 64)), np.zeros((1, 63, 64)), np.full((1, 64, 64), np.nan)], ids=["flat", "narrow", "nan"]
 )
-def test_refuses_other_views(views: np.ndarray) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        inference.load("robust").predict(views)
+def test_other_views_are_refused_with_and_without_torch(views: np.ndarray) -> None:
+    for network in (inference.load("robust"), checkpoint.load("robust")):
+        with pytest.raises(ValueError, match="expected"):
+            network.predict(views)
 
 
 def test_torch_computes_what_is_no_compact_network(tmp_path: Path, rng: np.random.Generator) -> None:

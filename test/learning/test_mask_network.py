@@ -46,12 +46,6 @@ def test_the_loss_is_a_weighted_cross_entropy() -> None:
     assert float(shard_training.mask_loss(logits, images, torch.full_like(truth, UNKNOWN))) == 0
 
 
-@pytest.mark.parametrize("config", [MaskConfig(), MaskConfig(pixels=32, widths=(4, 8, 8), blocks=2)], ids=str)
-def test_every_cell_has_a_logit(config: MaskConfig) -> None:
-    side = config.pixels
-    assert MaskNetwork(config)(torch.zeros(2, CHANNELS, side, side)).shape == (2, side, side)
-
-
 def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
     subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))

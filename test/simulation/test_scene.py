@@ -1,4 +1,7 @@
-"""Scenes: what is drawn obeys its protocol, rests on its plane and is seen where it lies; crowds touch."""
+"""Scenes: what is drawn obeys its protocol, rests on its plane and is seen where it lies; crowds touch.
+
+And of all that is simulated: a seed names it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,14 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.segments import segment
 from sq_perception.simulation import scenes, sensor_noise
+from sq_perception.simulation.furniture import things_in_furniture
+from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.scenes import Scene, plane_depth, table_scene, thesis_bodies, thesis_scene
+from sq_perception.simulation.segment_views import draw_segment_views
+from sq_perception.simulation.thing_views import draw_thing_views
+from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
+
+SMALL = TABLE_CAMERA.cropped(80, 60, 480, 360)
 
 
 def test_bodies_of_the_thesis_fill_the_ranges_of_its_protocol():
@@ -60,10 +70,24 @@ def test_every_pixel_lies_on_its_body_or_on_the_table(seed):
     assert np.abs(table @ scene.plane[:3] + scene.plane[3]).max() < 1e-5
 
 
-def test_a_seed_names_a_scene():
-    first, again, other = (table_scene(np.random.default_rng(seed), 2) for seed in (4, 4, 5))
-    np.testing.assert_array_equal(first.bodies.to_flat(), again.bodies.to_flat())
-    assert not np.allclose(first.bodies.to_flat(), other.bodies.to_flat())
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda rng: {"bodies": table_scene(rng, 2).bodies.to_flat()},
+        lambda rng: {"parts": np.concatenate([draw_thing(rng).parts.to_flat() for _ in range(3)])},
+        lambda rng: vars(things_on_table(rng, 3)),
+        lambda rng: vars(things_in_furniture("bin", rng, SMALL)),
+        lambda rng: vars(draw_thing_views(6, rng)),
+        lambda rng: vars(draw_segment_views(2, rng)),
+    ],
+    ids=["bodies", "things", "table", "furniture", "views of things", "views of segments"],
+)
+def test_a_seed_names_what_is_drawn(draw):
+    first, again, other = (draw(np.random.default_rng(seed)) for seed in (9, 9, 10))
+    arrays = [name for name, value in first.items() if isinstance(value, np.ndarray)]
+    for name in arrays:
+        np.testing.assert_array_equal(first[name], again[name])
+    assert not all(np.array_equal(first[name], other[name]) for name in arrays)
 
 
 def test_plane_straight_ahead_has_its_own_depth_and_its_back_is_not_seen():

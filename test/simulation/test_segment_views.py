@@ -40,12 +40,6 @@ def test_borders_cut_some(drawn: SegmentViews) -> None:
     assert 0 < np.count_nonzero(beside.any(axis=(1, 2))) < len(drawn.images)
 
 
-def test_the_same_seed_draws_the_same_views() -> None:
-    first, second = (draw_segment_views(2, np.random.default_rng(9)) for _ in range(2))
-    np.testing.assert_array_equal(first.images, second.images)
-    np.testing.assert_array_equal(first.truth, second.truth)
-
-
 def test_scenes_without_segments_give_an_empty_batch(monkeypatch: pytest.MonkeyPatch) -> None:
     nothing = FrameEvidence(np.zeros((1, 1), np.int32))
     monkeypatch.setattr(segment_views.segments, "segment", lambda *_: nothing)

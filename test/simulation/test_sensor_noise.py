@@ -274,13 +274,15 @@ def test_the_ideal_sensor_adds_its_deviation_and_nothing_else(rng):
 
 
 def test_misuse_is_named(rng):
+    images = (
+        (np.ones((4, 5)), "does not fit a camera of 320 x 240"),
+        (np.ones((240, 320), np.uint16), "expected a floating image"),
+        (np.ones((240, 320, 1)), "expected a floating image"),
+    )
     for model in (KINECT, AZURE, D435, Ideal(0.001)):
-        with pytest.raises(ValueError, match="does not fit a camera of 320 x 240"):
-            model.measure(np.ones((4, 5)), CAMERA, rng)
-        with pytest.raises(ValueError, match="expected a floating image"):
-            model.measure(np.ones((240, 320), np.uint16), CAMERA, rng)
-        with pytest.raises(ValueError, match="expected a floating image"):
-            model.measure(np.ones((240, 320, 1)), CAMERA, rng)
+        for image, words in images:
+            with pytest.raises(ValueError, match=words):
+                model.measure(image, CAMERA, rng)
         with pytest.raises(TypeError, match=r"numpy\.random\.Generator"):
             model.measure(wall(1.0), CAMERA, 7)
         for z in (0.0, -1.0, np.nan):
@@ -297,15 +299,11 @@ def test_misuse_is_named(rng):
             model.measure(np.ones((9, 9)), unit_cube.camera(9), rng)
     with pytest.raises(ValueError, match="expected one of kinect_v1, azure_kinect"):
         preset("lidar")
-    for change in ({"baseline": 0.0}, {"focal": -1.0}, {"far": 0.2}, {"window": (4, 5)}, {"blind": 60.0}, {"step": -1}):
-        with pytest.raises(ValueError, match=next(iter(change))):
-            dataclasses.replace(KINECT, **change)
-    with pytest.raises(ValueError, match="fattening"):
-        dataclasses.replace(D435, fattening=40)
-    with pytest.raises(ValueError, match="footprint"):
-        dataclasses.replace(AZURE, footprint=3.0)
-    with pytest.raises(ValueError, match="deviation"):
-        Ideal(float("nan"))
+    changes = {"baseline": 0.0, "focal": -1.0, "far": 0.2, "window": (4, 5), "blind": 60.0, "step": -1}
+    others = [(D435, "fattening", 40), (AZURE, "footprint", 3.0), (Ideal(), "deviation", float("nan"))]
+    for model, name, value in [*((KINECT, *change) for change in changes.items()), *others]:
+        with pytest.raises(ValueError, match=name):
+            dataclasses.replace(model, **{name: value})
     assert isinstance(KINECT, StructuredLight)
     assert isinstance(ZED, Stereo)
 

@@ -28,12 +28,8 @@ def alone(setting: Setting, camera: Camera | None = None) -> Setting:
 def finer(camera: Camera, times: int) -> Camera:
     """The same image with more pixels: centres are those of the pixels' middles."""
     return Camera(
-        camera.width * times,
-        camera.height * times,
-        camera.fx * times,
-        camera.fy * times,
-        (camera.cx + 0.5) * times - 0.5,
-        (camera.cy + 0.5) * times - 0.5,
+        camera.width * times, camera.height * times, camera.fx * times, camera.fy * times,
+        (camera.cx + 0.5) * times - 0.5, (camera.cy + 0.5) * times - 0.5,
     )
 
 
@@ -63,12 +59,6 @@ def test_views_look_as_promised() -> None:
     assert 0.6 < given.mean() < 0.95
     np.testing.assert_allclose(np.linalg.norm(views.planes[given, :3], axis=1), 1, atol=1e-6)
     assert set(views.kinds) <= set(range(len(KINDS)))
-
-
-def test_the_same_seed_draws_the_same_views() -> None:
-    first, second = (draw_thing_views(6, np.random.default_rng(11)) for _ in range(2))
-    for name in ("images", "planes", "support", "kinds"):
-        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
 def test_things_are_seen_from_the_elevations_that_are_drawn() -> None:
@@ -130,12 +120,8 @@ def test_a_mirrored_thing_has_the_mirrored_view() -> None:
         setting = alone(draw_setting(draw_thing(rng, [kind]), rng))
         camera = setting.camera
         other = Setting(
-            flipped(setting.parts),
-            flipped(setting.cavities) if len(setting.cavities) else NOTHING,
-            NOTHING,
-            None,
-            10.0,
-            Camera(camera.width, camera.height, camera.fx, camera.fy, camera.width - 1 - camera.cx, camera.cy),
+            flipped(setting.parts), flipped(setting.cavities) if len(setting.cavities) else NOTHING, NOTHING, None,
+            10.0, Camera(camera.width, camera.height, camera.fx, camera.fy, camera.width - 1 - camera.cx, camera.cy),
         )
         images, reaches = [], []
         for one in (setting, other):

@@ -55,9 +55,7 @@ def test_the_nearest_form_undoes_any_exact_one_with_its_covariance(rng):
     for form in range(8):
         seen = draw(truth, covariance, rng, form, np.zeros(11))
         states, covariances = association.nearest_form(
-            truth.to_flat()[None],
-            state.scale_sizes(noise(), truth.size)[None],
-            seen.superquadric.to_flat()[None],
+            truth.to_flat()[None], state.scale_sizes(noise(), truth.size)[None], seen.superquadric.to_flat()[None],
             seen.covariance[None],
         )
         np.testing.assert_allclose(state.difference(truth.to_flat(), states[0]), 0, atol=1e-9)
@@ -72,9 +70,7 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
         flat[:, 3:5] = shape
         count = len(flat)
         states, _ = association.nearest_form(
-            np.tile(truth.to_flat(), (count, 1)),
-            state.scale_sizes(noise(), np.tile(truth.size, (count, 1))),
-            flat,
+            np.tile(truth.to_flat(), (count, 1)), state.scale_sizes(noise(), np.tile(truth.size, (count, 1))), flat,
             state.scale_sizes(noise(), flat[:, :3]),
         )
         turn = quaternions.geodesic_angle(states[:, 8:12], truth.rotation)

@@ -16,6 +16,7 @@ from tracked_bodies import (
     draw,
     error_of,
     from_camera,
+    image_of,
     looking_at,
     nees,
     noise,
@@ -25,7 +26,6 @@ from tracked_bodies import (
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.raycast import render
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
 from sq_perception.simulation.sensor_noise import Ideal
@@ -42,34 +42,6 @@ def crossing(k, rng, same=True):
     a = body(centre=(x, 0.06, 0.8))
     b = body((0.05, 0.04, 0.03) if same else (0.03, 0.03, 0.06), centre=(-x, -0.06, 0.8))
     return [draw(a, noise(), rng), draw(b, noise(), rng)]
-
-
-def test_what_repeats_all_bodies_gives_what_a_comparison_gives(monkeypatch):
-    """Answers of still frames, in any order, some of them missing; new ones, moved bodies and cameras between them."""
-    rng, bodies = np.random.default_rng(0), spread_bodies(4, np.random.default_rng(1))
-    quick, thorough, repeated, shortcuts = Tracker(), Tracker(), tracker_module._repeat, []
-    monkeypatch.setattr(tracker_module, "_repeat", lambda *some: shortcuts.append(repeated(*some)) or shortcuts[-1])
-    seen, pose = [draw(each, noise(), rng) for each in bodies], (np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-    for k in range(100):
-        happens = rng.random()
-        if happens < 0.1:
-            seen = [draw(each, noise(), rng) for each in bodies]
-        elif happens < 0.15:
-            seen[rng.integers(4)] = draw(body(centre=rng.normal((0.1, 0.1, 0.8), 0.2)), noise(), rng)
-        elif happens < 0.2:
-            pose = pose[0], rng.normal(0, 0.002, 3)
-        old = [each._replace(repeats=int(happens >= 0.1)) for each in seen]
-        shown = [old[i] for i in rng.permutation(4)[: rng.integers(3, 5)]]
-        tracks = quick.update(shown, 0.05 * k, pose)
-        with monkeypatch.context() as patch:
-            patch.setattr(tracker_module, "_repeat", lambda *_: None)
-            compared = thorough.update(shown, 0.05 * k, pose)
-        for one, other in zip(tracks, compared, strict=True):
-            facts = [(each.id, each.seen, each.state, each.observation) for each in (one, other)]
-            assert facts[0] == facts[1]
-            np.testing.assert_array_equal(one.superquadric.to_flat(), other.superquadric.to_flat())
-            np.testing.assert_array_equal(one.covariance, other.covariance)
-    assert sum(each is not None for each in shortcuts) > 25
 
 
 @pytest.mark.parametrize("same", [True, False])
@@ -93,25 +65,18 @@ def test_ids_survive_an_occlusion_but_not_an_absence(rng):
     left, right = body(centre=(-0.15, 0, 0.8)), body(centre=(0.15, 0, 0.8))
     wall = body((0.12, 0.2, 0.01), (0.1, 0.1), (0.11, 0, 0.5), (0, 0, 0))
     tracker = Tracker()
-
-    def image(bodies):
-        depth, _ = render(Superquadric.stack(bodies), CAMERA)
-        return np.where(np.isfinite(depth), depth, 1.5).astype(np.float32)
-
     for k in range(5):
-        tracks = tracker.update(
-            [draw(left, noise(), rng), draw(right, noise(), rng)], k / 30, camera=CAMERA, depth=image([left, right])
-        )
+        seen = [draw(left, noise(), rng), draw(right, noise(), rng)]
+        tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=image_of([left, right]))
     for k in range(5, 15):
-        tracks = tracker.update([draw(left, noise(), rng)], k / 30, camera=CAMERA, depth=image([left, right, wall]))
+        tracks = tracker.update([draw(left, noise(), rng)], k / 30, camera=CAMERA, depth=image_of([left, right, wall]))
         assert [t.state for t in tracks] == [TrackState.CONFIRMED, TrackState.LOST]
         assert tracks[1].observation is None
     tracks = tracker.update([draw(left, noise(), rng), draw(right, noise(), rng)], 0.5)
     assert [t.id for t in tracks] == [1, 2]
-    counts = [
-        len(tracker.update([draw(left, noise(), rng)], 0.5 + k / 30, camera=CAMERA, depth=image([left])))
-        for k in range(1, 8)
-    ]
+    alone, counts = image_of([left]), []
+    for k in range(1, 8):
+        counts.append(len(tracker.update([draw(left, noise(), rng)], 0.5 + k / 30, camera=CAMERA, depth=alone)))
     assert counts == [2, 2, 2, 2, 1, 1, 1]
     tracks = tracker.update([draw(left, noise(), rng), draw(right, noise(), rng)], 0.8)
     assert [t.id for t in tracks] == [1, 3]
@@ -119,8 +84,7 @@ def test_ids_survive_an_occlusion_but_not_an_absence(rng):
 
 def test_what_is_there_but_was_not_recovered_does_not_die(rng):
     truth, tracker = body(), Tracker()
-    depth, _ = render(truth, CAMERA)
-    depth = np.where(np.isfinite(depth), depth, 1.5)
+    depth = image_of(truth)
     for k in range(20):
         tracks = tracker.update([draw(truth, noise(), rng)] if k < 4 else [], k / 30, camera=CAMERA, depth=depth)
     assert [t.state for t in tracks] == [TrackState.LOST]
@@ -130,8 +94,7 @@ def test_a_piece_beside_the_middle_of_what_is_seen_whole_does_not_stay(rng):
     """Its centre is no nearer to the whole one's than another thing's may be, but it lies in it."""
     whole = body((0.06, 0.05, 0.05), turn=(0, 0, 0))
     piece, beside = (body((0.02, 0.02, 0.02), centre=(x, 0, 0.8), turn=(0, 0, 0)) for x in (0.05, 0.085))
-    depth, _ = render(Superquadric.stack([whole, beside]), CAMERA)
-    depth = np.where(np.isfinite(depth), depth, 1.5)
+    depth = image_of([whole, beside])
     for other, lives in ((piece, False), (beside, True)):
         tracker = Tracker()
         for k in range(20):
@@ -144,8 +107,7 @@ def test_what_the_border_of_the_image_cuts_is_seen_to_have_gone(rng):
     """A third of it would be within the image; the table is seen there, or it."""
     cut, rest = body((0.05, 0.05, 0.05), centre=(0.475, 0, 0.8), turn=(0, 0, 0)), body()
     for scene, lives in (([rest], False), ([rest, cut], True)):
-        depth, _ = render(Superquadric.stack(scene), CAMERA)
-        depth, tracker = np.where(np.isfinite(depth), depth, 1.5), Tracker()
+        depth, tracker = image_of(scene), Tracker()
         for k in range(20):
             seen = [draw(each, noise(), rng) for each in ([rest, cut] if k < 4 else [rest])]
             tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
@@ -202,8 +164,7 @@ def test_a_hidden_body_does_not_lend_its_id_to_its_like(rng):
     """Two cans of a kind: one is hidden, then a third comes into view at some distance."""
     hidden, wall = body(), body((0.2, 0.2, 0.01), (0.1, 0.1), (0, 0, 0.5), (0, 0, 0))
     like = body(centre=(0.3, 0, 0.8))
-    depth, _ = render(Superquadric.stack([hidden, wall, like]), CAMERA)
-    for frame in ({"camera": CAMERA, "depth": depth}, {}):
+    for frame in ({"camera": CAMERA, "depth": image_of([hidden, wall, like], np.inf)}, {}):
         tracker = Tracker()
         tracker.update([draw(hidden, noise(), rng)], 0.0)
         tracks = tracker.update([draw(wall, noise(), rng), draw(like, noise(), rng)], 0.5, **frame)

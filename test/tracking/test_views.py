@@ -4,11 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracked_bodies import CAMERA, Seen, body, draw, error_of, from_camera, looking_at, nees, noise, spread_bodies
+from tracked_bodies import (
+    CAMERA,
+    Seen,
+    body,
+    draw,
+    error_of,
+    from_camera,
+    image_of,
+    looking_at,
+    nees,
+    noise,
+    spread_bodies,
+)
 from tracked_bodies import angle_between as turn
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.raycast import render
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import table_scene
 from sq_perception.simulation.sensor_noise import preset
@@ -79,10 +90,9 @@ def test_every_body_is_there_once_whoever_sees_it(order, rng):
         pose = looking_at(truths.translation.mean(axis=0), np.array([x, 0.05, -1.0]), 0.9)
         shown = truths if number < 2 else truths[:1]
         bodies = [from_camera(draw(each, noise(), rng), *pose) for each in shown]
-        scene = Superquadric.stack([*truths, wall] if number == 2 else list(truths))
+        scene = [*truths, wall] if number == 2 else truths
         local = [from_camera(Seen(each, np.eye(11)), *pose).superquadric for each in scene]
-        depth, _ = render(Superquadric.stack(local), CAMERA)
-        views.append(View(bodies, pose, CAMERA, np.where(np.isfinite(depth), depth, 3.0)))
+        views.append(View(bodies, pose, CAMERA, image_of(local, 3.0)))
     tracks = fuse_views(views[k] for k in order)
     assert sorted(track.seen for track in tracks) == [2, 3]
     for truth in truths:
