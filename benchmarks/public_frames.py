@@ -117,13 +117,13 @@ def summary(group: list[Answer]) -> dict[str, Any]:
     deviations = np.abs([each for one in group for each in one.deviations])
     return {
         "things": len(group),
-        "bodies": sum(np.isfinite(errors)),
+        "bodies": int(np.isfinite(errors).sum()),
         "edges median": figure(errors, np.median, 1e3),
         "edges mean": figure(errors, np.mean, 1e3),
         "converged": sum(one.status == "CONVERGED" for one in group),
         "within 2": figure(list(deviations < 2), np.mean, 100),
         "beyond 3": figure(list(deviations > 3), np.mean, 100),
-        "posed": sum(np.isfinite([one.iou for one in group])),
+        "posed": int(np.isfinite([one.iou for one in group]).sum()),
         "iou": figure([one.iou for one in group], np.mean, 100),
         "far side": figure(far, lambda known: np.abs(known).mean(), 1e3),
         "bias": figure(far, np.mean, 1e3),
