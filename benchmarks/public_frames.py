@@ -103,7 +103,7 @@ def _overlap(own: FrameRecovery, frame: RecordedFrame, label: int) -> float:
     true = (frame.labels == label) & measured
     labels = np.unique(own.labels[true])
     masks = [(own.labels == each) & measured for each in labels[labels > 0]]
-    return max((np.count_nonzero(mask & true) / np.count_nonzero(mask | true) for mask in masks), default=0.0)
+    return float(max((np.count_nonzero(mask & true) / np.count_nonzero(mask | true) for mask in masks), default=0.0))
 
 
 def summary(group: list[Answer]) -> dict[str, Any]:
@@ -170,7 +170,7 @@ def main() -> None:
     repositories = sorted({entry["repository"] for entry in sheet.values()})
     head = f"{len(sheet)} frames of {', '.join(repositories)}; {bodies / len(sheet):.1f} bodies a frame with own masks"
     text = f"{head}\n\n{report.table_of([cells(title, one) for title, one in figures.items()])}"
-    each = [asdict(one) for one in everything]
+    each = [{name: None if value != value else value for name, value in asdict(one).items()} for one in everything]
     result = {"repositories": repositories, "frames": len(sheet), "bodies": bodies, "groups": figures, "things": each}
     report.write(options.name, result, text)
 
