@@ -31,7 +31,7 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception 
 
 BESIDE := evaluation tracking
 # Benchmarks that want files or another network.
-ASKING := contact_graspnet known_frames picking_pictures point_pictures sensor_pictures worst_things
+ASKING := contact_graspnet known_frames picking_pictures point_pictures public_frames sensor_pictures worst_things
 CORE := geometry files imaging segmentation fitting tracking sq_msgs_py
 
 .PHONY: demo quick test test-computing test-processes lint speed bench docs install clean

@@ -38,8 +38,9 @@ from common.tabletop import Placed, Tabletop
 
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.priors import HullPrior
+from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import methods
-from sq_perception.recovery.recoverer import Recoverer
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.simulation import camera_stages
 from sq_perception.simulation.sensor_noise import preset
@@ -114,8 +115,10 @@ STAGES: dict[str, Callable[[Tabletop], Image]] = {
 }
 
 
-def sides(scene: Tabletop, image: Image, recoverer: Recoverer) -> list[Side]:
-    """The far sides of the things of a scene as they are recovered from an image of it."""
+def with_hulls(
+    recoverer: Recoverer, depth: np.ndarray, camera: Camera, labels: np.ndarray
+) -> tuple[FrameRecovery, dict[int, HullPrior]]:
+    """Recover a frame with given masks; also return the predicted hull of each label that has one."""
     hulls: dict[int, HullPrior] = {}
     fitted = methods.fit_view
 
@@ -126,7 +129,18 @@ def sides(scene: Tabletop, image: Image, recoverer: Recoverer) -> list[Side]:
         return fitted(one, *rest)
 
     with patch.object(methods, "fit_view", kept):
-        found = recoverer.recover(image.depth, scene.camera, image.labels)
+        return recoverer.recover(depth, camera, labels), hulls
+
+
+def far_side(hull: HullPrior, corners: np.ndarray) -> float:
+    """Error of a hull's far side beside true corners (n, 3), metres: in its direction nearest to the line of sight."""
+    nearest = int(np.argmax(hull.directions @ corners.mean(axis=0)))
+    return float(hull.support[nearest] - (corners @ hull.directions[nearest]).max())
+
+
+def sides(scene: Tabletop, image: Image, recoverer: Recoverer) -> list[Side]:
+    """The far sides of the things of a scene as they are recovered from an image of it."""
+    found, hulls = with_hulls(recoverer, image.depth, scene.camera, image.labels)
     bodies = {body.label: body for body in found.bodies if body.status != Status.FAILED}
     return [
         _side(scene.seed, each, image, bodies[each.label].superquadric, hulls[each.label])
@@ -141,9 +155,8 @@ def _side(seed: int, placed: Placed, image: Image, body: Any, hull: HullPrior) -
     far = float(sight @ body.translation + body.support(sight[None])[0] - (corners @ sight).max())
     errors = hull.support - (corners @ hull.directions.T).max(axis=0)
     deviation = np.sqrt(hull.freedom / (hull.freedom - 2) * np.diag(hull.covariance))
-    nearest = int(np.argmax(hull.directions @ sight))
     key = seed, placed.label
-    return Side(key, placed.thing.kind, 1e3 * float(errors[nearest]), 1e3 * far, 1e3 * errors, 1e3 * deviation)
+    return Side(key, placed.thing.kind, 1e3 * far_side(hull, corners), 1e3 * far, 1e3 * errors, 1e3 * deviation)
 
 
 def figures(by_stage: dict[str, list[Side]]) -> dict[str, Any]:

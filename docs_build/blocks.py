@@ -204,6 +204,22 @@ def known() -> str:
     return table(f"objects | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}", rows)
 
 
+def public() -> str:
+    """Things of known size in frames of public repositories, by kind."""
+    groups = results("public_frames")["groups"]
+    rows = []
+    for title, one in groups.items():
+        if not title.startswith("sensor"):
+            known = f"{one['edges median']:.1f} / {one['edges mean']:.1f}"
+            shares = "-" if one["within 2"] is None else f"{one['within 2']:.0f} / {one['beyond 3']:.0f}"
+            iou = "-" if one["iou"] is None else f"{one['iou']:.1f} ({one['posed']})"
+            far = "-" if one["far side"] is None else f"{one['far side']:.1f}; {one['bias']:+.1f}"
+            name = title.removeprefix("kind: ").replace("_", " ")
+            rows.append(f"{name} | {one['things']} | {known} | {shares} | {iou} | {far} | {one['found']}")
+    head = f"objects | number | {EDGES}, median / mean | CONVERGED: within 2 / beyond 3 sigma % | IoU % (posed)"
+    return table(f"{head} | far side of the predicted hull mm: error; bias | found, own masks", rows)
+
+
 ABLATIONS = {
     "whole": "as shipped",
     "no predicted hull": "no predicted hull",
@@ -275,6 +291,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         kinds,
         prediction,
         known,
+        public,
         ablation,
         recorded,
         frame_time,
