@@ -23,7 +23,7 @@ _NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 UINT32, FLOAT32 = 6, 7
 
 
-def described(names: str, unsigned: str) -> tuple[tuple[str, int], ...]:
+def field_types(names: str, unsigned: str) -> tuple[tuple[str, int], ...]:
     """Return fields by their names; all are float32 but the unsigned ones, which are uint32."""
     return tuple((name, UINT32 if name in unsigned.split() else FLOAT32) for name in names.split())
 

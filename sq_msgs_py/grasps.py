@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from moveit_msgs.msg import Grasp
     from sensor_msgs.msg import PointCloud2
 
-FIELDS = columns.described("x y z qx qy qz qw opening width score id", unsigned="id")
+FIELDS = columns.field_types("x y z qx qy qz qw opening width score id", unsigned="id")
 """Name and PointField datatype of every field, in the order of the message."""
 
 

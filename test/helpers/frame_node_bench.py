@@ -32,7 +32,7 @@ CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0
 DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] + [0.02, 0.03, 0.04]))
 
 
-def recovered(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
+def recovery(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
     return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 

@@ -103,8 +103,8 @@ class Bench(SpunNodes):
         request = ChangeState.Request(transition=Transition(id=transition, label=label))
         return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
 
-    def led_up(self) -> Bench:
-        """Configured and activated, as by a manager."""
+    def bring_up(self) -> Bench:
+        """Configure and activate, as a manager does."""
         assert self.change(Transition.TRANSITION_CONFIGURE)
         assert self.change(Transition.TRANSITION_ACTIVATE)
         return self.active()
@@ -185,7 +185,7 @@ class TestLifecycle:
         bench.made.clear()
         gc.collect()
         assert watched() is None, "the network is still in memory after the cleanup"
-        assert bench.led_up().answer() == 1.0
+        assert bench.bring_up().answer() == 1.0
         assert len(bench.made) == 1
         assert bench.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert bench.state() == "finalized"
@@ -237,7 +237,7 @@ class TestLifecycle:
         reason = "cannot configure: weights.safetensors: no such model file"
         bench.report(lambda one: one.level == DiagnosticStatus.ERROR and one.message == f"unconfigured: {reason}")
         bench.fault = None
-        assert bench.led_up().answer() == 1.0
+        assert bench.bring_up().answer() == 1.0
         bench.report(lambda one: one.level == DiagnosticStatus.OK)
 
     def test_an_autostart_that_fails_is_told_to_the_process(self, make_bench):

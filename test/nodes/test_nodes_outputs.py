@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 import soft_messages
 from builtin_interfaces.msg import Time
 from frame_node_bench import BOX, CAMERA, CAN
-from frame_node_bench import recovered as one
+from frame_node_bench import recovery as one
 from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 
