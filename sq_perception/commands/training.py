@@ -118,7 +118,7 @@ def segment_views(arguments: Sequence[str]) -> int:
     example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
     what = "segments of simulated scenes, and which of their readings are of their object,"
     command = _make_drawing_parser("segment-views", what, example, shards=40)
-    command.add_argument("--scenes", type=console.at_least(1), default=200, help="per shard, of some eleven views (200)")
+    command.add_argument("--scenes", type=console.at_least(1), default=200, help="per shard, about 11 views each (200)")
     given = command.parse_args(arguments)
 
     from sq_perception.simulation.segment_views import draw_segment_views
