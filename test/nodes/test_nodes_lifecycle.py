@@ -19,7 +19,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 import frame_node_bench
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from frame_node_bench import CAMERA, ball, counts_of, info_of, stand_ins
+from frame_node_bench import CAMERA, ball, counts_of, stand_ins
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -31,8 +31,9 @@ from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from sq_msgs_py.depth_image import depth_to_message, labels_to_message
+from sq_msgs_py.depth_image import depth_to_message, intrinsics_to_message, labels_to_message
 from sq_msgs_py.superquadrics import from_message
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes import managed_node
 from sq_perception.nodes.frame_node import FrameNode
 from sq_perception.recovery.recoverer import FrameRecovery
@@ -123,7 +124,7 @@ class Bench(SpunNodes):
     def publish(self, space: str = "", value: float = 0.5) -> Header:
         self.stamps += 1
         header = Header(stamp=Time(sec=1000 + self.stamps), frame_id=f"{space}_camera")
-        self.infos[space].publish(info_of(CAMERA, header))
+        self.infos[space].publish(intrinsics_to_message(intrinsics(CAMERA), header))
         self.images[space].publish(depth_to_message(np.full((48, 64), value), header))
         return header
 
