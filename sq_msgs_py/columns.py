@@ -92,18 +92,13 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = find_type) -> P
             points[name] = values[:, k]
     field = types("sensor_msgs/msg/PointField")
     return types("sensor_msgs/msg/PointCloud2")(
-        header=header,
-        height=1,
-        width=len(points),
+        header=header, height=1, width=len(points), is_bigendian=False, point_step=layout.itemsize,
+        row_step=layout.itemsize * len(points), data=byte_array(points),
+        is_dense=all(bool(np.isfinite(points[name]).all()) for name, _ in rows.FIELDS),
         fields=[
             field(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
             for name, datatype in rows.FIELDS
         ],
-        is_bigendian=False,
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * len(points),
-        data=byte_array(points),
-        is_dense=all(bool(np.isfinite(points[name]).all()) for name, _ in rows.FIELDS),
     )
 
 

@@ -235,11 +235,7 @@ def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTyp
     """Return a camera_info without distortion: K, R = I and P of the intrinsics."""
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     return types("sensor_msgs/msg/CameraInfo")(
-        header=header,
-        width=intrinsics.width,
-        height=intrinsics.height,
-        distortion_model="plumb_bob",
-        d=[0.0] * 5,
+        header=header, width=intrinsics.width, height=intrinsics.height, distortion_model="plumb_bob", d=[0.0] * 5,
         k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],

@@ -108,13 +108,10 @@ def moveit_grasps(
     for k, pose in enumerate(poses(placed, header, types).poses):
         found.append(
             grasp(
-                id=f"{k}",
-                pre_grasp_posture=posture(float(grasps.opening[k])),
+                id=f"{k}", pre_grasp_posture=posture(float(grasps.opening[k])),
                 grasp_posture=posture(float(min(grasps.width[k], grasps.opening[k]))),  # it may be wider than both say
-                grasp_pose=pose_stamped(header=header, pose=pose),
-                grasp_quality=float(grasps.score[k]),
-                pre_grasp_approach=straight(own, approach.tolist()),
-                post_grasp_retreat=straight(*retreat),
+                grasp_pose=pose_stamped(header=header, pose=pose), grasp_quality=float(grasps.score[k]),
+                pre_grasp_approach=straight(own, approach.tolist()), post_grasp_retreat=straight(*retreat),
                 allowed_touch_objects=[f"{prefix}{int(grasps.id[k])}"],
             )
         )
