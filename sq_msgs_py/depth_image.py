@@ -28,12 +28,7 @@ GREY_ENCODINGS = ("mono8", "mono16")
 LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1", "32SC1")
 
 _DTYPES: dict[str, type[Any]] = {
-    "mono8": np.uint8,
-    "8UC1": np.uint8,
-    "mono16": np.uint16,
-    "16UC1": np.uint16,
-    "32SC1": np.int32,
-    "32FC1": np.float32,
+    "mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16, "16UC1": np.uint16, "32SC1": np.int32, "32FC1": np.float32
 }
 
 

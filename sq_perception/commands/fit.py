@@ -85,12 +85,8 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
         whole = fit = fit_points(points, normals, taper=not options.no_taper, sigma=options.sigma)
         fits, shares = [fit], [fit.inlier_share]
     entry = {
-        "file": name,
-        "points": len(points),
-        "status": whole.status.name.lower(),
-        "message": whole.message,
-        "noise": whole.noise,
-        "ms": round(whole.milliseconds, 3),
+        "file": name, "points": len(points), "status": whole.status.name.lower(), "message": whole.message,
+        "noise": whole.noise, "ms": round(whole.milliseconds, 3),
         "superquadrics": [_entry(fit, share) for fit, share in zip(fits, shares, strict=True)],
     }
     # Plain numbers and lists for those of NumPy, and null for NaN and infinity, which JSON does not know.
@@ -101,16 +97,9 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
 def _entry(fit: Any, share: float) -> dict[str, Any]:
     body = fit.superquadric
     return {
-        "status": fit.status.name.lower(),
-        "message": fit.message,
-        "size": body.size,
-        "shape": body.shape,
-        "taper": body.taper,
-        "translation": body.translation,
-        "rotation": body.rotation,
-        "sigma_size": fit.sigma_size,
-        "covariance": fit.covariance,
-        "share": share,
+        "status": fit.status.name.lower(), "message": fit.message, "size": body.size, "shape": body.shape,
+        "taper": body.taper, "translation": body.translation, "rotation": body.rotation,
+        "sigma_size": fit.sigma_size, "covariance": fit.covariance, "share": share,
     }
 
 

@@ -517,15 +517,10 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
 @pytest.mark.parametrize(
     "values",
     [
-        {"target_frame": "/map"},
         {"fixed_frame": "/map"},
-        {"tf_prefix": "/body"},
-        {"tf_prefix": ""},
-        {"tf_prefix": "my body"},
-        {"target_frame": "base//link"},
-        {"target_frame": "base link"},
-        {"target_frame": "map", "projection": "orthographic"},
-        {"fixed_frame": "map", "projection": "orthographic"},
+        *({"target_frame": frame} for frame in ("/map", "base//link", "base link")),
+        *({"tf_prefix": prefix} for prefix in ("/body", "", "my body")),
+        *({name: "map", "projection": "orthographic"} for name in ("target_frame", "fixed_frame")),
     ],
 )
 def test_frames_that_tf2_would_not_take_are_refused(values):
