@@ -57,17 +57,10 @@ class GraspAnswer:
 def text_of(found: SuperquadricArray | GraspArray, header: Any, summary: str) -> str:
     """Return the message of an answer; ``header`` is that of the cloud."""
     columns = {column.name: getattr(found, column.name) for column in fields(found)}
-    return json.dumps(
-        {
-            "frame_id": header.frame_id,
-            "stamp": {"sec": header.stamp.sec, "nanosec": header.stamp.nanosec},
-            "summary": summary,
-            _NAMES[type(found)][0]: [
-                {name: _plain(column[k]) for name, column in columns.items()} for k in range(len(found))
-            ],
-        },
-        allow_nan=False,
-    )
+    rows = [{name: _plain(column[k]) for name, column in columns.items()} for k in range(len(found))]
+    stamp = {"sec": header.stamp.sec, "nanosec": header.stamp.nanosec}
+    answer = {"frame_id": header.frame_id, "stamp": stamp, "summary": summary, _NAMES[type(found)][0]: rows}
+    return json.dumps(answer, allow_nan=False)
 
 
 def from_response(response: Any) -> Answer:

@@ -23,7 +23,7 @@ _NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8
 UINT32, FLOAT32 = 6, 7
 
 
-def described(names: str, unsigned: str) -> tuple[tuple[str, int], ...]:
+def field_types(names: str, unsigned: str) -> tuple[tuple[str, int], ...]:
     """Return fields by their names; all are float32 but the unsigned ones, which are uint32."""
     return tuple((name, UINT32 if name in unsigned.split() else FLOAT32) for name in names.split())
 
@@ -92,18 +92,13 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = find_type) -> P
             points[name] = values[:, k]
     field = types("sensor_msgs/msg/PointField")
     return types("sensor_msgs/msg/PointCloud2")(
-        header=header,
-        height=1,
-        width=len(points),
+        header=header, height=1, width=len(points), is_bigendian=False, point_step=layout.itemsize,
+        row_step=layout.itemsize * len(points), data=byte_array(points),
+        is_dense=all(bool(np.isfinite(points[name]).all()) for name, _ in rows.FIELDS),
         fields=[
             field(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
             for name, datatype in rows.FIELDS
         ],
-        is_bigendian=False,
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * len(points),
-        data=byte_array(points),
-        is_dense=all(bool(np.isfinite(points[name]).all()) for name, _ in rows.FIELDS),
     )
 
 

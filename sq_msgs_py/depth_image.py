@@ -28,12 +28,7 @@ GREY_ENCODINGS = ("mono8", "mono16")
 LABEL_ENCODINGS = ("mono8", "8UC1", "mono16", "16UC1", "32SC1")
 
 _DTYPES: dict[str, type[Any]] = {
-    "mono8": np.uint8,
-    "8UC1": np.uint8,
-    "mono16": np.uint16,
-    "16UC1": np.uint16,
-    "32SC1": np.int32,
-    "32FC1": np.float32,
+    "mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16, "16UC1": np.uint16, "32SC1": np.int32, "32FC1": np.float32
 }
 
 
@@ -235,11 +230,7 @@ def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTyp
     """Return a camera_info without distortion: K, R = I and P of the intrinsics."""
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
     return types("sensor_msgs/msg/CameraInfo")(
-        header=header,
-        width=intrinsics.width,
-        height=intrinsics.height,
-        distortion_model="plumb_bob",
-        d=[0.0] * 5,
+        header=header, width=intrinsics.width, height=intrinsics.height, distortion_model="plumb_bob", d=[0.0] * 5,
         k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from moveit_msgs.msg import Grasp
     from sensor_msgs.msg import PointCloud2
 
-FIELDS = columns.described("x y z qx qy qz qw opening width score id", unsigned="id")
+FIELDS = columns.field_types("x y z qx qy qz qw opening width score id", unsigned="id")
 """Name and PointField datatype of every field, in the order of the message."""
 
 
@@ -108,13 +108,10 @@ def moveit_grasps(
     for k, pose in enumerate(poses(placed, header, types).poses):
         found.append(
             grasp(
-                id=f"{k}",
-                pre_grasp_posture=posture(float(grasps.opening[k])),
+                id=f"{k}", pre_grasp_posture=posture(float(grasps.opening[k])),
                 grasp_posture=posture(float(min(grasps.width[k], grasps.opening[k]))),  # it may be wider than both say
-                grasp_pose=pose_stamped(header=header, pose=pose),
-                grasp_quality=float(grasps.score[k]),
-                pre_grasp_approach=straight(own, approach.tolist()),
-                post_grasp_retreat=straight(*retreat),
+                grasp_pose=pose_stamped(header=header, pose=pose), grasp_quality=float(grasps.score[k]),
+                pre_grasp_approach=straight(own, approach.tolist()), post_grasp_retreat=straight(*retreat),
                 allowed_touch_objects=[f"{prefix}{int(grasps.id[k])}"],
             )
         )

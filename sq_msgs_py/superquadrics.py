@@ -75,7 +75,7 @@ class Reason(IntFlag):
     """The camera sees into an open vessel: it can be taken by its rim."""
 
 
-FIELDS = columns.described(
+FIELDS = columns.field_types(
     "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status label seen fused reason "
     "sigma_e1 sigma_e2 sigma_c1 sigma_c2 sigma_c3 sigma_r1 sigma_r2 sigma_r3 kx ky objectness part",
     unsigned="id status label seen fused reason part",

@@ -27,7 +27,7 @@ _NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(,[-+.\de]*)*|-inf(inity)
 
 def complain(message: str, code: int = FAILURE) -> int:
     """Print one line to standard error, without control characters from recordings; return the exit code."""
-    print(f"sq-perception: {printable(' '.join(message.split()))}", file=sys.stderr)
+    print(f"sq-perception: {replace_unprintable(' '.join(message.split()))}", file=sys.stderr)
     return code
 
 
@@ -45,7 +45,7 @@ def show_log() -> None:
         log.addHandler(_Complaints())
 
 
-def printable(text: str) -> str:
+def replace_unprintable(text: str) -> str:
     """Replace characters that cannot be printed, such as file name bytes that are no UTF-8, by question marks."""
     return "".join(c if c.isprintable() else "?" for c in text)
 
@@ -65,7 +65,7 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
     )
 
 
-def with_negatives(arguments: Sequence[str]) -> list[str]:
+def mark_negatives(arguments: Sequence[str]) -> list[str]:
     """Prepare arguments with negative numbers, so that argparse takes none of them for an option.
 
     It does so with -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores.

@@ -8,17 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sq_perception.commands.console import (
-    STANDARD_OUTPUT,
-    SUCCESS,
-    USAGE,
-    at_least,
-    complain,
-    parser,
-    positive,
-    text_target,
-    write_document,
-)
+from sq_perception.commands import console
 
 HELP = """\
 Fit superquadrics to point clouds or meshes of single objects, seen from all sides or some.
@@ -40,16 +30,16 @@ examples:
 
 def main(arguments: Sequence[str]) -> int:
     """Run ``sq-perception fit``; return the exit code."""
-    command = parser("fit", HELP, EPILOG)
+    command = console.parser("fit", HELP, EPILOG)
     add = command.add_argument
     add("files", nargs="+", metavar="FILE", help="clouds or meshes of one object each")
-    add("--most", type=at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)")
-    add("--sigma", type=positive, metavar="S", help="noise of the points in their unit (default: estimated)")
+    add("--most", type=console.at_least(1, 20), default=1, metavar="N", help="fit up to N bodies (default 1)")
+    add("--sigma", type=console.positive, metavar="S", help="noise of the points in their unit (default: estimated)")
     add("--no-taper", action="store_true", help="fit no taper (one body only)")
-    add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
+    add("--json", type=console.text_target, metavar="OUT", help="write the results there; - is the standard output")
     options = command.parse_args(arguments)
     if options.no_taper and options.most > 1:
-        return complain("--no-taper: only with one body", USAGE)
+        return console.complain("--no-taper: only with one body", console.USAGE)
     return _run(options)
 
 
@@ -58,26 +48,26 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.cloud_file import read_surface
 
     if options.json and Path(options.json).resolve() in {Path(name).resolve() for name in options.files}:
-        return complain(f"--json: {options.json} is read as well", USAGE)
-    code, entries = SUCCESS, []
+        return console.complain(f"--json: {options.json} is read as well", console.USAGE)
+    code, entries = console.SUCCESS, []
     for name in options.files:
         try:
             entry = _fit(name, read_surface(Path(name)), options)
         except (UnpackingError, OSError, ValueError) as error:
-            code = complain(f"{name}: {error}")
+            code = console.complain(f"{name}: {error}")
             continue
         entries.append(entry)
-        if options.json != STANDARD_OUTPUT:
+        if options.json != console.STANDARD_OUTPUT:
             print(f"{name}  {entry['ms']:.0f} ms  {entry['status']}: {entry['message']}")
             for number, body in enumerate(entry["superquadrics"]):
                 print(f"  {number} {_line(body)}")
     if options.json:
         document = {"format": "sq_perception.points", "version": 1, "files": entries}
         text = json.dumps(document, indent=1, allow_nan=False) + "\n"
-        if (entries or options.json == STANDARD_OUTPUT) and (
-            problem := write_document("json", options.json, text, code == SUCCESS)
+        if (entries or options.json == console.STANDARD_OUTPUT) and (
+            problem := console.write_document("json", options.json, text, code == console.SUCCESS)
         ):
-            complain(problem)
+            console.complain(problem)
     return code
 
 
@@ -95,12 +85,8 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
         whole = fit = fit_points(points, normals, taper=not options.no_taper, sigma=options.sigma)
         fits, shares = [fit], [fit.inlier_share]
     entry = {
-        "file": name,
-        "points": len(points),
-        "status": whole.status.name.lower(),
-        "message": whole.message,
-        "noise": whole.noise,
-        "ms": round(whole.milliseconds, 3),
+        "file": name, "points": len(points), "status": whole.status.name.lower(), "message": whole.message,
+        "noise": whole.noise, "ms": round(whole.milliseconds, 3),
         "superquadrics": [_entry(fit, share) for fit, share in zip(fits, shares, strict=True)],
     }
     # Plain numbers and lists for those of NumPy, and null for NaN and infinity, which JSON does not know.
@@ -111,16 +97,9 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
 def _entry(fit: Any, share: float) -> dict[str, Any]:
     body = fit.superquadric
     return {
-        "status": fit.status.name.lower(),
-        "message": fit.message,
-        "size": body.size,
-        "shape": body.shape,
-        "taper": body.taper,
-        "translation": body.translation,
-        "rotation": body.rotation,
-        "sigma_size": fit.sigma_size,
-        "covariance": fit.covariance,
-        "share": share,
+        "status": fit.status.name.lower(), "message": fit.message, "size": body.size, "shape": body.shape,
+        "taper": body.taper, "translation": body.translation, "rotation": body.rotation,
+        "sigma_size": fit.sigma_size, "covariance": fit.covariance, "share": share,
     }
 
 

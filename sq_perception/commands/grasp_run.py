@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from sq_perception.commands import console
-from sq_perception.commands.console import STANDARD_OUTPUT, USAGE, complain
 from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import kernel_cache, mesh
@@ -37,7 +36,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         hand = gripper(options.gripper)
     except ValueError as error:
-        return complain(str(error), USAGE)
+        return console.complain(str(error), console.USAGE)
     friction = options.friction or planner.FRICTION
     try:
         reading = Reading(
@@ -48,21 +47,21 @@ def run(options: argparse.Namespace) -> int:
         )
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
-            return complain(problem, USAGE)
+            return console.complain(problem, console.USAGE)
         entries: list[dict[str, Any]] = []
         code, is_whole = _plan_all(recorded, Recoverer(), hand, friction, options, entries)
         chosen = {"gripper": hand.name, "friction": friction}
         document = {"format": "sq_perception.grasps", "version": 1, "options": chosen, "frames": entries}
         text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist) + "\n"
-        is_printed = options.json == STANDARD_OUTPUT
+        is_printed = options.json == console.STANDARD_OUTPUT
         is_wanted = is_printed or (options.json and entries)
         if is_wanted and (problem := console.write_document("json", options.json, text, is_whole)):
-            complain(problem)
+            console.complain(problem)
         if not is_printed:
             _print_table(entries)
         return code
     except (FrameError, CheckpointError, OSError) as error:
-        return complain(str(error))
+        return console.complain(str(error))
 
 
 def _plan_all(
@@ -75,25 +74,25 @@ def _plan_all(
     try:
         for file, frame in recorded:
             if isinstance(frame, FrameError):
-                code = complain(str(frame))
+                code = console.complain(str(frame))
                 continue
             if frame.is_cube:
-                code = complain(f"{file}: a view of the unit cube has no metres to grasp in")
+                code = console.complain(f"{file}: a view of the unit cube has no metres to grasp in")
                 continue
             for text in filter(None, (frame.warning, frame.notes)):
-                complain(f"{file}: {text}")
+                console.complain(f"{file}: {text}")
             stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
             try:
                 bodies = _bodies(stem, frame, recoverer, hand, friction, options)
             except (ValueError, ArithmeticError) as error:  # such as a camera of no image
-                code = complain(f"{file}: {frame.name}: {error}")
+                code = console.complain(f"{file}: {frame.name}: {error}")
                 continue
             stamp = None if frame.stamp is None else frame.stamp._asdict()
             entries.append({"file": plain_name(file), "stamp": stamp, "bodies": bodies})
     except KeyboardInterrupt:
-        return complain("interrupted; what is done so far is kept", console.INTERRUPTED), False
+        return console.complain("interrupted; what is done so far is kept", console.INTERRUPTED), False
     except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
-        return complain(str(error)), False
+        return console.complain(str(error)), False
     return code, True
 
 
@@ -104,7 +103,7 @@ def _bodies(
     settings = RecoveryOptions(free_space=frame.has_free_space, parts=options.parts)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:
-        complain(f"{frame.name}: {recovery.message}")
+        console.complain(f"{frame.name}: {recovery.message}")
     found = recovery.recovered
     numbers = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)

@@ -15,12 +15,12 @@ from sq_perception.commands.console import (
     argument,
     at_least,
     folder,
+    mark_negatives,
     number,
     parser,
     positive,
     target,
     text_target,
-    with_negatives,
 )
 
 HELP = """\
@@ -163,7 +163,7 @@ def recover(arguments: Sequence[str]) -> int:
         "--workspace", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box in the optical frame, metres, for the centres of objects",
     )
-    options = command.parse_args(with_negatives(arguments))
+    options = command.parse_args(mark_negatives(arguments))
 
     from sq_perception.commands import recover_run
 
@@ -205,7 +205,7 @@ def grasp(arguments: Sequence[str]) -> int:
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
-    options = command.parse_args(with_negatives(arguments))
+    options = command.parse_args(mark_negatives(arguments))
 
     from sq_perception.commands import grasp_run
 

@@ -187,7 +187,7 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     from sq_perception.evaluation.plots import save
     from sq_perception.evaluation.recovery_figure import recovery_figure
 
-    save(recovery_figure(frame.depth, frame.camera, recovery, console.printable(frame.name)), path)
+    save(recovery_figure(frame.depth, frame.camera, recovery, console.replace_unprintable(frame.name)), path)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

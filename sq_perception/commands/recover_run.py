@@ -20,7 +20,6 @@ from dataclasses import replace
 from typing import Any
 
 from sq_perception.commands import console
-from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, USAGE, complain
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import CUT_SHORT, Status
 from sq_perception.geometry import kernel_cache
@@ -96,28 +95,28 @@ def _details(body: Mapping[str, Any]) -> str:
 
 def run(options: argparse.Namespace) -> int:
     """Run ``sq-perception recover`` with these options; return the exit code."""
-    if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
-        return complain("--json, --jsonl, --csv: only one of them can be the standard output", USAGE)
+    if [options.json, options.jsonl, options.csv].count(console.STANDARD_OUTPUT) > 1:
+        return console.complain("--json, --jsonl, --csv: only one of them can be the standard output", console.USAGE)
     if options.poses and (options.method not in ("auto", "symmetry") or options.projection == "orthographic"):
-        return complain("--poses: expected a pinhole camera, and a method with deviations: auto or symmetry", USAGE)
+        return console.complain("--poses: expected a pinhole camera, and the method auto or symmetry", console.USAGE)
     if options.verbose:
         logging.getLogger("sq_perception").setLevel(logging.INFO)
     kernel_cache.compile_beside()
     try:
         this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
-        return complain(str(error))
+        return console.complain(str(error))
     except ValueError as error:
-        return complain(str(error), USAGE)
+        return console.complain(str(error), console.USAGE)
     code = this.over_all_frames()
     this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
-        code = complain(problem, code or FAILURE)
-    if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
+        code = console.complain(problem, code or console.FAILURE)
+    if console.STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
         for line in (*lines(this.outputs.results, options.verbose), *scene_lines(this.outputs.scene)):
             print(line)
     if not options.quiet:
-        complain(this.summary())
+        console.complain(this.summary())
     return code
 
 
@@ -157,7 +156,7 @@ class RecoverRun:
         done.add(self.outputs.done)
         poses = CameraPoses(options.poses) if options.poses else None
         is_tracked = options.track or poses is not None
-        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}"), poses) if is_tracked else None
+        self._tracks = RecordedTracks(lambda text: console.complain(f"warning: {text}"), poses) if is_tracked else None
         self._unreadable = 0
         self._said: dict[str, set[str]] = {}
 
@@ -170,18 +169,18 @@ class RecoverRun:
                         raise frame
                     self._frame(file, frame, answer)
                 except FrameError as error:
-                    complain(str(error))
+                    console.complain(str(error))
                     self._unreadable += 1
                 except OSError as error:  # of a file that is written: the disk is full, and will be for the next frame
-                    return complain(str(error))
+                    return console.complain(str(error))
         except KeyboardInterrupt:
-            return complain("interrupted; what is done so far is kept", console.INTERRUPTED)
+            return console.complain("interrupted; what is done so far is kept", console.INTERRUPTED)
         finally:
             for text, files in self._said.items():
                 if len(files) > 1:
-                    complain(f"{_count(len(files) - 1, 'more file')}: {text}")
+                    console.complain(f"{_count(len(files) - 1, 'more file')}: {text}")
         self.is_whole = True
-        return FAILURE if self._unreadable else console.SUCCESS
+        return console.FAILURE if self._unreadable else console.SUCCESS
 
     def scene(self) -> list[dict[str, Any]]:
         """Return the bodies of all frames together, with camera poses."""
@@ -233,7 +232,7 @@ class RecoverRun:
     def _frame(self, file: str, frame: RecordedFrame, answer: FrameRecovery | Exception) -> None:
         for text in (f"warning: {frame.warning}" if frame.warning else "", frame.notes):
             if text and text not in self._said:
-                complain(f"{file}: {text}")
+                console.complain(f"{file}: {text}")
             if text:
                 self._said.setdefault(text, set()).add(file)
         if isinstance(answer, (ValueError, ArithmeticError, workers.WorkerLostError)):  # such as a camera of no image

@@ -7,15 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import (
-    SUCCESS,
-    USAGE,
-    at_least,
-    complain,
-    parser,
-    target,
-    with_negatives,
-)
+from sq_perception.commands import console
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -38,11 +30,11 @@ examples:
 
 def sample(arguments: Sequence[str]) -> int:
     """Run ``sq-perception sample``; return the exit code."""
-    command = parser("sample", _SAMPLE_HELP, _SAMPLE_EPILOG)
-    command.add_argument("output", type=target, metavar="FILE", help="an .npz")
+    command = console.parser("sample", _SAMPLE_HELP, _SAMPLE_EPILOG)
+    command.add_argument("output", type=console.target, metavar="FILE", help="an .npz")
     output = command.parse_args(arguments).output
     if output.suffix.lower() != ".npz":
-        return complain(f"{output}: expected a name that ends in .npz", USAGE)
+        return console.complain(f"{output}: expected a name that ends in .npz", console.USAGE)
 
     import numpy as np
 
@@ -57,7 +49,7 @@ def sample(arguments: Sequence[str]) -> int:
     for name, body in zip(made.names, made.bodies, strict=True):
         edges = edges_as_text(body.size, unknown, is_cube=False)
         print(f"  {name:8}{edges:22} at {place_as_text(body.translation, is_cube=False)}")
-    return SUCCESS
+    return console.SUCCESS
 
 
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
@@ -83,16 +75,16 @@ files:
 
 def render(arguments: Sequence[str]) -> int:
     """Run ``sq-perception render``; return the exit code."""
-    command = parser("render", _RENDER_HELP, _RENDER_EPILOG)
+    command = console.parser("render", _RENDER_HELP, _RENDER_EPILOG)
     add = command.add_argument
     for name in PARAMETERS:
         add(name, type=float)
-    add("--output", "-o", type=target, required=True, metavar="FILE", help=".png, .bmp or .npz")
+    add("--output", "-o", type=console.target, required=True, metavar="FILE", help=".png, .bmp or .npz")
     add("--projection", choices=("orthographic", "pinhole"), default="orthographic")
-    add("--width", type=at_least(1), help="pixels (256 orthographic, 640 pinhole)")
-    add("--height", type=at_least(1), help="pixels (as the width orthographic, 480 pinhole)")
+    add("--width", type=console.at_least(1), help="pixels (256 orthographic, 640 pinhole)")
+    add("--height", type=console.at_least(1), help="pixels (as the width orthographic, 480 pinhole)")
     add("--focal", type=float, help="focal length of the pinhole camera, pixels (525)")
-    return _render(command.parse_args(with_negatives(arguments)))
+    return _render(command.parse_args(console.mark_negatives(arguments)))
 
 
 def _render(options: argparse.Namespace) -> int:
@@ -101,12 +93,12 @@ def _render(options: argparse.Namespace) -> int:
     pinhole = options.projection == "pinhole"
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
-        return complain(f"--output: {output.name}: an image of this projection is a {kinds}", USAGE)
+        return console.complain(f"--output: {output.name}: an image of this projection is a {kinds}", console.USAGE)
     beside = output.with_suffix(".yaml")
     if pinhole and suffix == ".png" and beside.exists() and not output.exists():
-        return complain(f"{beside}: the camera of {output.name} goes there, but something else has that name")
+        return console.complain(f"{beside}: the camera of {output.name} goes there, but something else has that name")
     if not pinhole and options.focal is not None:
-        return complain("--focal: of a pinhole camera; see --projection", USAGE)
+        return console.complain("--focal: of a pinhole camera; see --projection", console.USAGE)
 
     import numpy as np
 
@@ -117,22 +109,22 @@ def _render(options: argparse.Namespace) -> int:
     try:
         given = np.array([getattr(options, name) for name in PARAMETERS])
         if not np.isfinite(given).all():
-            return complain(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}", USAGE)
+            raise ValueError(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
         body = Superquadric.from_flat(given)
         seen = body if pinhole else unit_cube.optical_from_cube(body)
         camera = _camera(options)
     except ValueError as error:
-        return complain(str(error), USAGE)
+        return console.complain(str(error), console.USAGE)
     width, height = camera.width, camera.height
     longest = 10**6  # that OpenCV and libpng write and read
     if width * height > MOST_PIXELS or max(width, height) > longest:  # nor would any command read it
         expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {longest}"
-        return complain(f"{expected}, got {width} x {height}", USAGE)
+        return console.complain(f"{expected}, got {width} x {height}", console.USAGE)
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
-        complain("the camera does not see the body: the image is empty")
+        console.complain("the camera does not see the body: the image is empty")
     _write_depth(output, depth, index, camera, body)
-    return SUCCESS
+    return console.SUCCESS
 
 
 def _camera(options: argparse.Namespace) -> Camera:
@@ -169,7 +161,7 @@ def _write_depth(output: Path, depth: np.ndarray, index: np.ndarray, camera: Cam
         millimetres, most = np.round(1e3 * depth), np.iinfo(np.uint16).max
         image = np.where(millimetres <= most, millimetres, 0).astype(np.uint16)
         if (millimetres[index >= 0] > most).any():
-            complain(f"what is beyond 65.535 m is left out: {output.name} holds no more, an .npz does")
+            console.complain(f"what is beyond 65.535 m is left out: {output.name} holds no more, an .npz does")
         numbers = {"rows": 3, "cols": 3, "data": camera.matrix.ravel().tolist()}
         info = {"image_width": camera.width, "image_height": camera.height, "camera_matrix": numbers}
         output_file.write(output.with_suffix(".yaml"), yaml.safe_dump(info, sort_keys=False).encode())

@@ -12,17 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import (
-    FAILURE,
-    INTERRUPTED,
-    SUCCESS,
-    at_least,
-    complain,
-    folder,
-    parser,
-    positive,
-    progress,
-)
+from sq_perception.commands import console
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 from sq_perception.learning import training_config
 from sq_perception.learning.training_config import CHOICES, MASK_RUN, THING_RUN, ShardTraining, TrainingConfig
@@ -47,7 +37,7 @@ examples:
 
 def train(arguments: Sequence[str]) -> int:
     """Run ``sq-perception train``; return the exit code."""
-    command = parser("train", _TRAIN_HELP, _TRAIN_EPILOG)
+    command = console.parser("train", _TRAIN_HELP, _TRAIN_EPILOG)
     command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
     shipped = ", ".join(training_config.shipped_names())
     command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
@@ -68,7 +58,7 @@ def train(arguments: Sequence[str]) -> int:
 
     from sq_perception.learning import train as training
 
-    with progress() as bar:
+    with console.progress() as bar:
         task = bar.add_task("training", total=config.steps)
 
         def advance(step: int, loss: float) -> None:
@@ -84,10 +74,10 @@ def _end_of(name: str, work: Callable[[], object]) -> int:
     try:
         work()
     except Stopped as stopped:
-        return complain(f"{name}: {stopped}", INTERRUPTED)
+        return console.complain(f"{name}: {stopped}", console.INTERRUPTED)
     except (ValueError, ArithmeticError, OSError) as error:
-        return complain(f"{name}: {error}")
-    return SUCCESS
+        return console.complain(f"{name}: {error}")
+    return console.SUCCESS
 
 
 _DRAW = """\
@@ -108,7 +98,7 @@ def thing_views(arguments: Sequence[str]) -> int:
     """Run ``sq-perception thing-views``; return the exit code."""
     example = "sq-perception thing-views sets/things --shards 200 && sq-perception train-things sets/things"
     command = _make_drawing_parser("thing-views", "canonical views of simulated household objects", example, shards=100)
-    command.add_argument("--views", type=at_least(1), default=512, help="views per shard (512)")
+    command.add_argument("--views", type=console.at_least(1), default=512, help="views per shard (512)")
     command.add_argument(
         "--meshes", type=Path, metavar="FOLDER", help="your own objects, in metres, for half of the views"
     )
@@ -128,7 +118,7 @@ def segment_views(arguments: Sequence[str]) -> int:
     example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
     what = "segments of simulated scenes, and which of their readings are of their object,"
     command = _make_drawing_parser("segment-views", what, example, shards=40)
-    command.add_argument("--scenes", type=at_least(1), default=200, help="a shard, of some eleven views each (200)")
+    command.add_argument("--scenes", type=console.at_least(1), default=200, help="per shard, about 11 views each (200)")
     given = command.parse_args(arguments)
 
     from sq_perception.simulation.segment_views import draw_segment_views
@@ -138,12 +128,12 @@ def segment_views(arguments: Sequence[str]) -> int:
 
 def _make_drawing_parser(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
     """Make the common parser of both commands that draw."""
-    command = parser(name, _DRAW.format(what=what), f"example:\n  {example}")
+    command = console.parser(name, _DRAW.format(what=what), f"example:\n  {example}")
     add = command.add_argument
     add("folder", type=Path, help="of the shards")
-    add("--shards", type=at_least(1), default=shards, help="total number of shards (%(default)s)")
-    add("--first", type=at_least(0), default=0, help="number of the first one (0)")
-    add("--seed", type=at_least(0), default=0, help="default 0")
+    add("--shards", type=console.at_least(1), default=shards, help="total number of shards (%(default)s)")
+    add("--first", type=console.at_least(0), default=0, help="number of the first one (0)")
+    add("--seed", type=console.at_least(0), default=0, help="default 0")
     return command
 
 
@@ -178,19 +168,19 @@ def train_masks(arguments: Sequence[str]) -> int:
 
 def _train(subject: str, run: ShardTraining, text: str, example: str, arguments: Sequence[str]) -> int:
     """Run one of both commands that train on shards."""
-    command = parser(f"train-{subject}", text, f"example:\n  {example}")
+    command = console.parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
     add = command.add_argument
     add("views", type=Path, metavar="FOLDER", help="of the shards of views")
     add("--output", "-o", type=Path, default=Path(f"runs/{subject}"), help="folder (%(default)s)")
-    add("--minutes", type=positive, help="training time, over which the learning rate falls (%(default)s)")
-    add("--batch", type=at_least(1), help="views per step (%(default)s)")
-    add("--rate", dest="learning_rate", metavar="RATE", type=positive, help="largest learning rate (%(default)s)")
-    add("--threads", type=at_least(0), help="threads of torch; 0: its own choice")
+    add("--minutes", type=console.positive, help="training time, over which the learning rate falls (%(default)s)")
+    add("--batch", type=console.at_least(1), help="views per step (%(default)s)")
+    add("--rate", dest="learning_rate", metavar="RATE", type=console.positive, help="largest one (%(default)s)")
+    add("--threads", type=console.at_least(0), help="threads of torch; 0: its own choice")
     add("--device", help="cpu or cuda (%(default)s)")
-    add("--validation", type=at_least(1), help="steps between two validations (%(default)s)")
-    add("--held", type=at_least(1), help="shards that are kept for validation (%(default)s)")
-    add("--seed", type=at_least(0), help="default %(default)s")
+    add("--validation", type=console.at_least(1), help="steps between two validations (%(default)s)")
+    add("--held", type=console.at_least(1), help="shards that are kept for validation (%(default)s)")
+    add("--seed", type=console.at_least(0), help="default %(default)s")
     add("--start", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
     add("--bfloat16", action="store_true", help="bfloat16 arithmetic, twice as fast on processors that have it")
     options = vars(command.parse_args(arguments))
@@ -227,14 +217,14 @@ examples:
 
 def evaluate(arguments: Sequence[str]) -> int:
     """Run ``sq-perception evaluate``; return the exit code, a failure if a model could not be read."""
-    command = parser("evaluate", _EVALUATE_HELP, _EVALUATE_EPILOG)
+    command = console.parser("evaluate", _EVALUATE_HELP, _EVALUATE_EPILOG)
     add = command.add_argument
     add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
     add("--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})")
-    add("--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
-    add("--fit-bodies", type=at_least(1), default=FIT_BODIES, metavar="N", help=f"the first N for fits ({FIT_BODIES})")
-    add("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
-    add("--output", type=folder, default="runs/evaluation", metavar="DIR", help="folder (runs/evaluation)")
+    add("--bodies", type=console.at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
+    add("--fit-bodies", type=console.at_least(1), default=FIT_BODIES, metavar="N", help=f"and for fits ({FIT_BODIES})")
+    add("--seed", type=console.at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
+    add("--output", type=console.folder, default="runs/evaluation", metavar="DIR", help="folder (runs/evaluation)")
     options = command.parse_args(arguments)
     methods: list[Method] = list(dict.fromkeys(FITS if options.methods is None else options.methods))
     if options.models == [] and not methods:
@@ -253,11 +243,11 @@ def _run_evaluation(options: argparse.Namespace, methods: list[Method], command:
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
     contestants, failures = _contestants(options, methods)
     for failure in failures:
-        complain(failure)
+        console.complain(failure)
     if not contestants:
-        return complain("nothing is left to evaluate")
+        return console.complain("nothing is left to evaluate")
     images = ThesisImages(max(count for _, count in contestants), options.seed)
-    with progress() as bar:
+    with console.progress() as bar:
         tasks = {contestant.name: bar.add_task(contestant.name, total=count) for contestant, count in contestants}
         outcomes = compare(contestants, images, advance=lambda name, done: bar.update(tasks[name], completed=done))
     facts = {
@@ -269,7 +259,7 @@ def _run_evaluation(options: argparse.Namespace, methods: list[Method], command:
     written, entries = thesis_report.write(options.output, outcomes, images, facts, failures)
     print("\n\n".join(table.markdown() for table in thesis_report.overview(entries)))
     print(f"written: {written}")
-    return FAILURE if failures else SUCCESS
+    return console.FAILURE if failures else console.SUCCESS
 
 
 def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:

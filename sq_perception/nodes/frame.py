@@ -34,7 +34,7 @@ MaskMessage: TypeAlias = Any
 """A label image, or a yolo_msgs/DetectionArray, which is imported only where it is installed."""
 
 
-def newest() -> QoSProfile:
+def newest_qos() -> QoSProfile:
     """Return the quality of service of images: keep only the newest, as a queue would delay slow subscribers.
 
     Made anew each time, as rclpy writes overrides into it.

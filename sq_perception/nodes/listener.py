@@ -21,7 +21,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from sq_perception.nodes import process
-from sq_perception.nodes.frame import newest
+from sq_perception.nodes.frame import newest_qos
 from sq_perception.nodes.statistics import THROTTLE, Statistics
 
 _RELIABILITIES = {
@@ -86,7 +86,7 @@ class Listener:
         return self._asked or (best_effort if best_effort in offered else QoSReliabilityPolicy.RELIABLE)
 
     def _subscribe(self, reliability: QoSReliabilityPolicy) -> None:
-        self._qos = newest()  # rclpy writes the overrides into it
+        self._qos = newest_qos()  # rclpy writes the overrides into it
         self._qos.reliability = reliability
         events = SubscriptionEventCallbacks(
             matched=lambda _: self.follow(), incompatible_qos=lambda _: self._on_incompatible(),

@@ -182,35 +182,28 @@ class OptionalOutputs:
         """
         self.follow(parameters)
         has_frame = bool(found.header.frame_id)
+        array, header, prefix = found.array, found.header, parameters.tf_prefix
         heard = self._heard("publish_tf")
-        if has_frame and heard and len(found.array.recovered):
+        if has_frame and heard and len(array.recovered):
             message: Any = heard.msg_type
-            heard.publish(message(transforms=transforms(found.array, found.header, prefix=parameters.tf_prefix)))
+            heard.publish(message(transforms=transforms(array, header, prefix=prefix)))
         if heard := self._heard("publish_detections"):
-            heard.publish(
-                detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
-            )
-        heard = self._heard("publish_collision_objects")
-        if heard is not None:
-            if self._planner_came.is_set():
-                self._planner_came.clear()
-                self._scene.forget()
-            self._publish_scene(heard, found, parameters, hidden)
-
-    def _publish_scene(
-        self, planners: Publisher, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
-    ) -> None:
-        """Publish the changes of the planning scene, from time to time all of it."""
+            heard.publish(detections(array, header, covariances=found.covariances, prefix=prefix))
+        planners = self._heard("publish_collision_objects")
+        if planners is None:
+            return
+        if self._planner_came.is_set():
+            self._planner_came.clear()
+            self._scene.forget()
         if monotonic() >= self._all_due:
             self._scene.repeat()
             # A planner receives none while it plans, and a lost message would leave its world wrong for good.
             self._all_due = monotonic() + 5.0
-        if not (parameters.publish_collision_objects and found.header.frame_id):
+        if not (parameters.publish_collision_objects and has_frame):
             return
         objects = self._scene.changes(
-            found.array, found.header, hidden, rests=bool(parameters.target_frame) or not parameters.fixed_frame,
-            meshes=(lambda: found.meshes) if parameters.collision_shapes == "mesh" else None,
-            prefix=parameters.tf_prefix,
+            array, header, hidden, rests=bool(parameters.target_frame) or not parameters.fixed_frame,
+            meshes=(lambda: found.meshes) if parameters.collision_shapes == "mesh" else None, prefix=prefix,
         )
         if objects:
             planners.publish(collision_objects.planning_scene(objects))

@@ -15,10 +15,11 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from spun_nodes import PATIENCE, SpunNodes
 from std_msgs.msg import Header
 
-from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_msgs_py.depth_image import depth_to_message, intrinsics_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import engine
 from sq_perception.nodes.frame_node import FrameNode
@@ -32,7 +33,7 @@ CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0
 DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] + [0.02, 0.03, 0.04]))
 
 
-def recovered(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
+def recovery(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
     return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
@@ -48,11 +49,6 @@ def counts_of(node: FrameNode) -> Any:
         counts = {what: one._counts[what] for what in ("received", "answered", "dropped", "refused")}
         in_work = 2 * counts["received"] - sum(counts.values())
         return SimpleNamespace(**counts, in_work=in_work, lost=dict(one._lost), last_error=one._last_error)
-
-
-def info_of(camera: Camera, header: Header) -> CameraInfo:
-    known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-    return intrinsics_to_message(known, header)
 
 
 class Recoverer:
@@ -129,7 +125,7 @@ class Bench(SpunNodes):
         self.put_info(self.info(camera))
 
     def info(self, camera: Camera = CAMERA) -> CameraInfo:
-        return info_of(camera, self.header())
+        return intrinsics_to_message(intrinsics(camera), self.header())
 
     def put_info(self, message: CameraInfo) -> None:
         self.until(self.infos.get_subscription_count)

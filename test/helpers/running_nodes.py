@@ -23,10 +23,12 @@ from spun_nodes import SpunNodes
 from started_nodes import Child
 from std_msgs.msg import Header
 
-from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_msgs_py.depth_image import depth_to_message, intrinsics_to_message
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import process
+from sq_perception.nodes.frame import stamp_of
 from sq_perception.simulation.scenes import Scene
 
 PATIENCE = 90.0
@@ -62,12 +64,6 @@ def until(condition: Callable[[], Any], alive: Sequence[Child] = (), patience: f
     return result
 
 
-def nanoseconds(message: Any) -> int:
-    """The stamp of a message."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-
-
 @dataclass(frozen=True)
 class Answer:
     """One result: when it arrived, how old its image was then, and the message."""
@@ -79,7 +75,7 @@ class Answer:
     @property
     def stamp(self) -> int:
         """Nanoseconds."""
-        return nanoseconds(self.message)
+        return stamp_of(self.message)
 
 
 @dataclass(frozen=True)
@@ -137,8 +133,7 @@ class Peer(SpunNodes):
             found = self._answers[node] = []
 
             def heard(message: PointCloud2) -> None:
-                # Not with rclpy's Time, which a stamp before 1970 does not fit into.
-                age = 1e-6 * (self.node.get_clock().now().nanoseconds - nanoseconds(message))
+                age = 1e-6 * (self.node.get_clock().now().nanoseconds - stamp_of(message))
                 found.append(Answer(time.monotonic(), age, message))
 
             self.listen(PointCloud2, f"{node}/superquadrics", heard)
@@ -209,8 +204,7 @@ class Peer(SpunNodes):
     ) -> tuple[Image, CameraInfo]:
         """The image of bodies with a stamp of now, and its camera_info."""
         header = self.header(frame_id)
-        known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        return depth_to_message(_rendered(bodies, camera), header), intrinsics_to_message(known, header)
+        return depth_to_message(_rendered(bodies, camera), header), intrinsics_to_message(intrinsics(camera), header)
 
     def ask(
         self, node: str, image: Image, info: CameraInfo, alive: Sequence[Child] = (), space: str = "/",
@@ -218,10 +212,8 @@ class Peer(SpunNodes):
     ) -> Answer:
         """Publish a frame in a namespace, again ``every`` so often as best effort may lose it, until it is answered."""
         heard = self.answers(node)
-        images, infos = (
-            self.publisher(Image, f"{space}depth/image"),
-            self.publisher(CameraInfo, f"{space}depth/camera_info"),
-        )
+        images = self.publisher(Image, f"{space}depth/image")
+        infos = self.publisher(CameraInfo, f"{space}depth/camera_info")
         until(lambda: images.get_subscription_count() and infos.get_subscription_count(), alive)
         until(lambda: self.node.count_publishers(f"{node}/superquadrics"), alive)
         sent: list[float] = []

@@ -148,12 +148,8 @@ def test_grasp_node_publishes_and_answers_in_it():
         upright = superquadrics.SuperquadricArray(
             **{
                 **{name: getattr(bodies(1), name) for name in ("score", "residual", "status", "objectness")},
-                "id": [7],
-                "size": [[0.02, 0.02, 0.05]],
-                "shape": [[0.2, 1.0]],
-                "translation": [[0.0, 0.0, 0.5]],
-                "rotation": [[0.7071068, 0.0, 0.0, 0.7071068]],
-                "sigma_size": [[0.001, 0.001, 0.001]],
+                "id": [7], "size": [[0.02, 0.02, 0.05]], "shape": [[0.2, 1.0]], "translation": [[0.0, 0.0, 0.5]],
+                "rotation": [[0.7071068, 0.0, 0.0, 0.7071068]], "sigma_size": [[0.001, 0.001, 0.001]],
             }
         )
         clouds.publish(superquadrics.to_message(upright, Header(frame_id="camera")))

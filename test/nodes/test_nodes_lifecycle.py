@@ -19,7 +19,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 import frame_node_bench
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from frame_node_bench import CAMERA, ball, counts_of, info_of, stand_ins
+from frame_node_bench import CAMERA, ball, counts_of, stand_ins
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -31,8 +31,9 @@ from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from sq_msgs_py.depth_image import depth_to_message, labels_to_message
+from sq_msgs_py.depth_image import depth_to_message, intrinsics_to_message, labels_to_message
 from sq_msgs_py.superquadrics import from_message
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes import managed_node
 from sq_perception.nodes.frame_node import FrameNode
 from sq_perception.recovery.recoverer import FrameRecovery
@@ -103,8 +104,8 @@ class Bench(SpunNodes):
         request = ChangeState.Request(transition=Transition(id=transition, label=label))
         return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
 
-    def led_up(self) -> Bench:
-        """Configured and activated, as by a manager."""
+    def bring_up(self) -> Bench:
+        """Configure and activate, as a manager does."""
         assert self.change(Transition.TRANSITION_CONFIGURE)
         assert self.change(Transition.TRANSITION_ACTIVATE)
         return self.active()
@@ -123,7 +124,7 @@ class Bench(SpunNodes):
     def publish(self, space: str = "", value: float = 0.5) -> Header:
         self.stamps += 1
         header = Header(stamp=Time(sec=1000 + self.stamps), frame_id=f"{space}_camera")
-        self.infos[space].publish(info_of(CAMERA, header))
+        self.infos[space].publish(intrinsics_to_message(intrinsics(CAMERA), header))
         self.images[space].publish(depth_to_message(np.full((48, 64), value), header))
         return header
 
@@ -185,7 +186,7 @@ class TestLifecycle:
         bench.made.clear()
         gc.collect()
         assert watched() is None, "the network is still in memory after the cleanup"
-        assert bench.led_up().answer() == 1.0
+        assert bench.bring_up().answer() == 1.0
         assert len(bench.made) == 1
         assert bench.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
         assert bench.state() == "finalized"
@@ -237,7 +238,7 @@ class TestLifecycle:
         reason = "cannot configure: weights.safetensors: no such model file"
         bench.report(lambda one: one.level == DiagnosticStatus.ERROR and one.message == f"unconfigured: {reason}")
         bench.fault = None
-        assert bench.led_up().answer() == 1.0
+        assert bench.bring_up().answer() == 1.0
         bench.report(lambda one: one.level == DiagnosticStatus.OK)
 
     def test_an_autostart_that_fails_is_told_to_the_process(self, make_bench):

@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from running_nodes import BODIES, PATIENCE, Peer, arguments, environment, nanoseconds, until
+from running_nodes import BODIES, PATIENCE, Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from started_nodes import Child
 from std_srvs.srv import SetBool
@@ -21,6 +21,7 @@ from sq_msgs_py.depth_image import depth_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.frame import stamp_of
 from sq_perception.recordings.publication import superquadrics
 
 BODY = BODIES[:1]
@@ -138,7 +139,7 @@ def test_publishers_come_and_go(recover_node, peer, start):
         known, seen = len(truth), len(heard)
 
         def pair(known: int = known, seen: int = seen) -> tuple[PointCloud2, PointCloud2] | None:
-            stamps = {nanoseconds(one): one for one in truth[known:]}
+            stamps = {stamp_of(one): one for one in truth[known:]}
             return next(((stamps[one.stamp], one.message) for one in heard[seen:] if one.stamp in stamps), None)
 
         expected, got = until(pair, (recover_node,))

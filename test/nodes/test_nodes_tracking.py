@@ -14,8 +14,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
-from frame_node_bench import BOX, CAMERA, CAN, FRAME_ID, Bench
-from frame_node_bench import recovered as recovery
+from frame_node_bench import BOX, CAMERA, CAN, FRAME_ID, Bench, recovery
 from spun_nodes import PATIENCE
 from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
