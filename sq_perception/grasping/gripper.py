@@ -32,25 +32,6 @@ def _are_numbers(value: object, shape: tuple[int, ...]) -> bool:
 class Gripper:
     """A parallel gripper.
 
-    Attributes
-    ----------
-    opening
-        The largest distance between the pads.
-    finger_width, finger_thickness
-        Along x and along y.
-    tip, palm
-        Distances from the TCP to the fingers' ends and back to the palm.
-    hand : (3,)
-        Full sizes of the box behind the palm.
-    force
-        The force of one finger when it holds.
-    link
-        The link of the gripper's model that the pose of the TCP is given in.
-    link_from_tcp : (3,), (4,)
-        Position and quaternion x y z w of the TCP in that link: p_link = R p_tcp + t.
-    joints
-        The fingers' joints in that model, each of which moves by half of the opening; none where fingers turn.
-
     Raises
     ------
     ValueError
@@ -60,15 +41,25 @@ class Gripper:
 
     name: str
     opening: float
+    """The largest distance between the pads."""
     finger_width: float
+    """Along x."""
     finger_thickness: float
+    """Along y."""
     tip: float
+    """From the TCP to the fingers' ends."""
     palm: float
+    """From the TCP back to the palm."""
     hand: tuple[float, float, float]
+    """Full sizes of the box behind the palm."""
     force: float
+    """The force of one finger when it holds."""
     link: str
+    """The link of the gripper's model that the pose of the TCP is given in."""
     link_from_tcp: tuple[tuple[float, float, float], tuple[float, float, float, float]]
+    """Position and quaternion x y z w of the TCP in that link: p_link = R p_tcp + t."""
     joints: tuple[str, ...] = ()
+    """The fingers' joints in that model, each of which moves by half of the opening; none where fingers turn."""
 
     def __post_init__(self) -> None:
         for field in fields(self):

@@ -14,31 +14,22 @@ from sq_perception.geometry import rotation as quaternions
 
 @dataclass(frozen=True, eq=False)
 class Grasp:
-    """A grasp.
-
-    Attributes
-    ----------
-    body
-        Position of its body in the batch, or the number of its thing where bodies are parts of things.
-    position, rotation : (3,), (4,)
-        Pose of the TCP in the frame of the bodies; the rotation is a quaternion x y z w.
-    opening
-        Distance between the fingers before they close.
-    width
-        Width of the body between them.
-    score
-        Probability that it holds.
-    weakest
-        The margin that takes most from the score.
-    """
+    """A grasp."""
 
     body: int
+    """Position of its body in the batch, or the number of its thing where bodies are parts of things."""
     position: np.ndarray
+    """(3,), of the TCP in the frame of the bodies."""
     rotation: np.ndarray
+    """(4,), quaternion x y z w."""
     opening: float
+    """Distance between the fingers before they close."""
     width: float
+    """Width of the body between them."""
     score: float
+    """Probability that it holds."""
     weakest: str
+    """The margin that takes most from the score."""
 
     def to_body_frame(self, points: np.ndarray) -> np.ndarray:
         """Transform points (j, 3) from the TCP's frame to the frame of the bodies."""
@@ -47,18 +38,12 @@ class Grasp:
 
 @dataclass(frozen=True, eq=False)
 class GraspPlan:
-    """Grasps of all bodies, the most probable first, and why bodies have none.
-
-    Attributes
-    ----------
-    grasps
-        At most :data:`sq_perception.grasping.planner.PER_BODY` a body.
-    reasons
-        One a body, empty for those with a grasp.
-    """
+    """Grasps of all bodies, the most probable first, and why bodies have none."""
 
     grasps: tuple[Grasp, ...] = ()
+    """At most :data:`sq_perception.grasping.planner.PER_BODY` a body."""
     reasons: tuple[str, ...] = ()
+    """One a body, empty for those with a grasp."""
 
     def of(self, body: int) -> tuple[Grasp, ...]:
         """Return the grasps of one body, best first."""

@@ -18,16 +18,6 @@ _MOST = 6000
 class Surroundings:
     """All that a gripper must avoid beside the bodies, in their frame.
 
-    Attributes
-    ----------
-    plane : (4,), optional
-        What the bodies stand on: the height above it is n.p + d, n up and of length 1.
-    points : (j, 3)
-        Measured points of objects; the table's are not among them.
-    depth, camera
-        A depth image in metres, NaN for no reading, and its pinhole camera, if the frame is the optical one: space
-        behind its surfaces is unseen.
-
     Raises
     ------
     ValueError
@@ -35,9 +25,13 @@ class Surroundings:
     """
 
     plane: np.ndarray | None = None
+    """(4,), what the bodies stand on: the height above it is n.p + d, n up and of length 1."""
     points: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    """(j, 3), measured points of objects; the table's are not among them."""
     depth: np.ndarray | None = None
+    """In metres, NaN for no reading, if the frame is the optical one: space behind its surfaces is unseen."""
     camera: Camera | None = None
+    """The pinhole camera of ``depth``."""
 
     def __post_init__(self) -> None:
         if self.plane is not None:

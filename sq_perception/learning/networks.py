@@ -72,7 +72,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.imaging.segment_view import CHANNELS
-from sq_perception.learning.layout import BLOCK, CELLS_AT_ONCE, TORCHVISION_BLOCK
+from sq_perception.learning.layout import BLOCK, CELLS_AT_ONCE, TORCHVISION_BLOCK, heads
 from sq_perception.learning.network_config import (
     BODY_OUTPUTS,
     EXTENT,
@@ -180,12 +180,10 @@ class Regressor(nn.Module):
             nn.Flatten(), nn.Linear(inputs, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden),
             nn.ReLU(),
         )
-        self.size_head = nn.Linear(config.hidden, 3)
-        self.shape_head = nn.Linear(config.hidden, 2)
-        self.translation_head = nn.Linear(config.hidden, 3)
-        self.rotation_head = nn.Linear(config.hidden, 6)
+        for name, outputs in heads(config).items():
+            self.add_module(name, nn.Linear(config.hidden, outputs))
         with torch.no_grad():
-            self.rotation_head.bias.copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
+            self.get_parameter("rotation_head.bias").copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
 
     def forward(self, views: torch.Tensor) -> Superquadric:
         """Superquadrics (n,) of views (n, 1, p, p)."""
@@ -195,8 +193,7 @@ class Regressor(nn.Module):
         """Outputs (n, 14) of the heads: size 3, shape 2, translation 3, rotation 6, all unbounded."""
         h = self.mixer(self.features(views)).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
-            heads = (self.size_head, self.shape_head, self.translation_head, self.rotation_head)
-            return torch.cat([head(h) for head in heads], dim=-1)
+            return torch.cat([self.get_submodule(name)(h) for name in heads(self.config)], dim=-1)
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ from sq_perception.learning import checkpoint
 from sq_perception.learning.inference import check_device
 from sq_perception.learning.network_config import mirror_planes
 from sq_perception.learning.networks import HullPrediction, MaskNetwork, ThingNetwork, body_loss
-from sq_perception.learning.training import Course, TrainingState, run, threads
+from sq_perception.learning.training import Task, TrainingState, run, threads
 from sq_perception.learning.training_config import ShardTraining
 from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.segment_views import UNKNOWN, YES, SegmentViews, draw_segment_views
@@ -67,7 +68,7 @@ between two validations."""
 
 
 @dataclass(frozen=True)
-class Subject:
+class NetworkKind:
     """What is particular to a network that is trained on shards of views, a dataclass of arrays (n, ...)."""
 
     name: str
@@ -78,11 +79,11 @@ class Subject:
     """A network to begin with, from the weights that :attr:`ShardTraining.start` names."""
     batch: Callable[[Any, np.ndarray, np.random.Generator], tuple[np.ndarray, ...]]
     """What the network takes of the views of these numbers, varied at random, and last the truth about them."""
-    loss: Callable[..., torch.Tensor]
-    """Loss of the network's output for a batch, and of that batch."""
+    loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]
+    """As :attr:`Task.loss`."""
     validate: Callable[[Any, Any], dict[str, Any]]
     """Figures of the network on views."""
-    finish: Callable[[Any, Any], None] = lambda network, views: None
+    finish: Callable[..., None] = lambda network, views: None
     """Changes a network when its training ends, by views that it was not trained on: errors on the others are smaller,
     by a seventh after 8 million views of 700 000."""
 
@@ -102,7 +103,7 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
 
 def read_views(none: Any, paths: list[Path]) -> Any:
     """All views of some shards; a ValueError if one is damaged, or not in the form of ``none``, or all are empty."""
-    kind, shards = type(none), []
+    form, shards = type(none), []
     for path in paths:
         try:
             arrays = load_arrays(str(path))
@@ -112,10 +113,10 @@ def read_views(none: Any, paths: list[Path]) -> Any:
                 if array.shape != shape or array.dtype != wanted.dtype:
                     raise ValueError(f"{name}: expected {wanted.dtype} {shape}, got {array.dtype} {array.shape}")
         except (SafetensorError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: not a readable shard of {kind.__name__}: {error}") from error
+            raise ValueError(f"{path}: not a readable shard of {form.__name__}: {error}") from error
     if not any(len(shard[0]) for shard in shards):
         raise ValueError(f"{paths[0].parent}: expected views in {', '.join(path.name for path in paths)}, found none")
-    return kind(*(np.concatenate(parts) for parts in zip(*shards, strict=True)))
+    return form(*(np.concatenate(parts) for parts in zip(*shards, strict=True)))
 
 
 def _to_stored(views: Any) -> dict[str, np.ndarray]:
@@ -123,7 +124,7 @@ def _to_stored(views: Any) -> dict[str, np.ndarray]:
     return {**vars(views), "images": views.images.astype(np.float16)}
 
 
-def train(subject: Subject, config: ShardTraining, views: Path, output: Path) -> Any:
+def train(kind: NetworkKind, config: ShardTraining, views: Path, output: Path) -> Any:
     """Run, or continue, a training; returns the averaged network, also kept in ``output``/NAME.safetensors.
 
     Raises ValueError if the folder holds no more shards than are kept for validation, or one that cannot be read, or
@@ -136,30 +137,26 @@ def train(subject: Subject, config: ShardTraining, views: Path, output: Path) ->
         torch.manual_seed(config.seed)
         output.mkdir(parents=True, exist_ok=True)
         goes_on = (output / "state.safetensors").exists()  # and has all weights, though the start may be gone
-        state = TrainingState.begin(subject.network("" if goes_on else config.start).to(device), config, output)
+        state = TrainingState.begin(kind.network("" if goes_on else config.start).to(device), config, output)
         rng = np.random.default_rng([config.seed, state.step])
         state.held = state.held or [shard.name for shard in _shards(views, config.held)[: config.held]]
-        held = read_views(subject.none, [views / name for name in state.held])
+        held = read_views(kind.none, [views / name for name in state.held])
         shards = _choose_shards(views, state.held, rng)
-        pool = read_views(subject.none, shards)
+        pool = read_views(kind.none, shards)
 
         def batch() -> tuple[tuple[torch.Tensor, ...], torch.Tensor]:
-            drawn = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
+            drawn = kind.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
             *shown, truth = (torch.from_numpy(np.ascontiguousarray(each)).to(device) for each in drawn)
             return tuple(shown), truth
 
         def validate(network: Any) -> dict[str, Any]:
             nonlocal shards, pool
             if (chosen := _choose_shards(views, state.held, rng)) != shards:
-                shards, pool = chosen, read_views(subject.none, chosen)
-            return subject.validate(network, held)
+                shards, pool = chosen, read_views(kind.none, chosen)
+            return kind.validate(network, held)
 
-        course = Course(
-            f"train-{subject.name}", subject.name, batch,
-            lambda predicted, shown, truth, progress: subject.loss(predicted, *shown, truth), validate,
-            lambda network: subject.finish(network, held),
-        )
-        return run(state, config, course)
+        finish = partial(kind.finish, views=held)
+        return run(state, config, Task(f"train-{kind.name}", kind.name, batch, kind.loss, validate, finish))
 
 
 def _shards(folder: Path, held: int) -> list[Path]:
@@ -183,9 +180,7 @@ def _choose_shards(folder: Path, held: Sequence[str], rng: np.random.Generator) 
     return [shards[k] for k in np.sort(drawn[fit])]
 
 
-def hull_loss(
-    predicted: HullPrediction, _views: torch.Tensor, _planes: torch.Tensor, _extents: torch.Tensor, truth: torch.Tensor
-) -> torch.Tensor:
+def hull_loss(predicted: HullPrediction, _shown: Any, truth: torch.Tensor, _progress: float) -> torch.Tensor:
     """The loss for true support functions (b, J); see the module."""
     return (
         predicted.negative_log_likelihood(truth).mean() / truth.shape[1]
@@ -246,8 +241,11 @@ def _thing_batch(views: ThingViews, chosen: np.ndarray, rng: np.random.Generator
     return images, planes, extents, np.where(turned[:, None], support[:, mirrored(0)], support)
 
 
-def mask_loss(logits: torch.Tensor, images: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+def mask_loss(
+    logits: torch.Tensor, shown: tuple[torch.Tensor, ...], truth: torch.Tensor, _progress: float = 0.0
+) -> torch.Tensor:
     """The loss of logits (b, p, p) for views (b, CHANNELS, p, p) and their truth (b, p, p); see the module."""
+    (images,) = shown
     weight = torch.where(images[:, SEGMENT] > 0, 1.0, AROUND) * (truth != UNKNOWN)
     each = torch.nn.functional.binary_cross_entropy_with_logits(logits, (truth == YES).float(), reduction="none")
     return (weight * each).sum() / weight.sum().clamp_min(1)
@@ -286,11 +284,11 @@ def _mask_batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generato
     return images.transpose(0, 3, 1, 2), truth
 
 
-THINGS = Subject(
+THINGS = NetworkKind(
     "things", draw_thing_views(0, np.random.default_rng(0)), _begin_things, _thing_batch, hull_loss, validate_things,
     calibrate_spread,
 )
-MASKS = Subject(
+MASKS = NetworkKind(
     "masks", draw_segment_views(0, np.random.default_rng(0)),
     lambda start: checkpoint.load_masks(start) if start else MaskNetwork(), _mask_batch, mask_loss, validate_masks,
 )

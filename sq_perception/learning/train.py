@@ -23,7 +23,7 @@ from sq_perception.learning.dataset import POOL, Disturbance, ViewPool, ViewSour
 from sq_perception.learning.inference import check_device
 from sq_perception.learning.losses import Objective
 from sq_perception.learning.networks import Regressor, RegressorConfig
-from sq_perception.learning.training import Course, Stopped, TrainingState, read_settings, run, threads
+from sq_perception.learning.training import Stopped, Task, TrainingState, read_settings, run, threads
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 
 __all__ = ["Stopped", "recalibrate", "train", "validate"]
@@ -66,10 +66,10 @@ def train(
         state = TrainingState.begin(model, config, output, _OF_A_RUN)
         if any(before.get(name, getattr(config, name)) != getattr(config, name) for name in _VALIDATED):
             state.best, state.plateau = -math.inf, Plateau()  # what was best was so of other views
-        return run(state, config, _course(config, state, device), advance)
+        return run(state, config, _task(config, state, device), advance)
 
 
-def _course(config: TrainingConfig, state: TrainingState, device: torch.device) -> Course:
+def _task(config: TrainingConfig, state: TrainingState, device: torch.device) -> Task:
     calibration = 2048  # views from which normalisations are measured anew
     form = state.model.config
     objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end, config.framing)
@@ -110,7 +110,7 @@ def _course(config: TrainingConfig, state: TrainingState, device: torch.device) 
     def score(figures: dict[str, Any]) -> tuple[float, float]:
         return float(np.mean([figures[name] for name in sets])), 1 - figures["iou"]
 
-    return Course("train", "last", batch, loss, validate_sets, score=score)
+    return Task("train", "last", batch, loss, validate_sets, score=score)
 
 
 def validate(

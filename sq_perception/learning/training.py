@@ -1,6 +1,6 @@
 """The loop that trains every network: take a batch, predict, compare, step; now and then validate and keep.
 
-What differs between networks is a :class:`Course`: :mod:`sq_perception.learning.train` has that of the regressor,
+What differs between networks is a :class:`Task`: :mod:`sq_perception.learning.train` has that of the regressor,
 :mod:`sq_perception.learning.shard_training` those of the networks of things and masks.  Gradients are clipped; an
 exponential average of the weights is what is validated and kept.
 
@@ -41,7 +41,7 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
 
 
 @dataclass(frozen=True)
-class Course:
+class Task:
     """What is particular to the training of one network."""
 
     command: str
@@ -193,7 +193,7 @@ def read_settings(state: Path) -> dict[str, Any]:
 
 
 def run(
-    state: TrainingState, config: Run, course: Course, advance: Callable[[int, float], None] = lambda step, loss: None
+    state: TrainingState, config: Run, task: Task, advance: Callable[[int, float], None] = lambda step, loss: None
 ) -> Any:
     """Run a training to its end; returns the averaged network, which the folder of the state keeps.
 
@@ -212,17 +212,17 @@ def run(
         if losses:
             record["loss"] = float(np.mean(losses))
         losses.clear()
-        record.update(course.validate(state.average))
-        _keep(state, config, course, record)
+        record.update(task.validate(state.average))
+        _keep(state, config, task, record)
 
     with _stop_requests() as stop_requested:
         while (progress := config.progress(state.step, state.seconds, state.plateau)) < 1:
             rate = config.rate(state.step, progress, state.plateau)
-            views, truth = course.batch()
+            views, truth = task.batch()
             state.model.train()
             with mixed_precision(device.type, config.bfloat16):
                 predicted = state.model(*views)
-            loss = course.loss(predicted, views, truth, progress)
+            loss = task.loss(predicted, views, truth, progress)
             state.descend(loss, rate, config.average)
             losses.append(loss.item())
             advance(state.step, losses[-1])
@@ -237,26 +237,26 @@ def run(
                 saved = time.monotonic()
             if stop_requested():
                 raise Stopped(f"stopped after step {state.step}; the same command goes on from {state.path}")
-    course.finish(state.average)
+    task.finish(state.average)
     if validated != state.step:
         validate()
     return state.average.eval()
 
 
-def _keep(state: TrainingState, config: Run, course: Course, record: dict[str, Any]) -> None:
+def _keep(state: TrainingState, config: Run, task: Task, record: dict[str, Any]) -> None:
     """Log the figures of a validation; save the averaged network, as the best one too where none was better."""
     print(json.dumps(record), flush=True)
     with state.path.with_name("log.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(record) + "\n")
-    names = [course.newest]
-    if course.score is not None:
-        score, loss = course.score(record)
+    names = [task.newest]
+    if task.score is not None:
+        score, loss = task.score(record)
         state.plateau.record(loss)
         if score >= state.best:
             state.best = score
             names.append("model")
     device = next(state.model.parameters()).device
-    made = provenance.facts(f"sq-perception {course.command}")
+    made = provenance.facts(f"sq-perception {task.command}")
     if device.type != "cpu":
         made["device"] = torch.cuda.get_device_name(device)
     notes = {"training": {**asdict(config), "start": Path(config.start).name}, "made": made, "metrics": record}

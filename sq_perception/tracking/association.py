@@ -50,7 +50,7 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import inline_kernel, kernel, support
 from sq_perception.tracking import state
-from sq_perception.tracking.state import CENTRE, HAND, LENGTH, POSE, SHAPE, SIZE, SIZE_AND_SHAPE, TURN
+from sq_perception.tracking.state import CENTRE, HAND, LENGTH, SHAPE, SIZE, SIZE_AND_SHAPE, TURN
 
 DEEP = 0.5
 """D over both supports, 1 where bodies touch, below which they are in one place: no two things are.  Chosen."""
@@ -280,9 +280,9 @@ def nearest_form(
 
 def loosen_pose(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Covariances (n, 11, 11) of bodies that were carried by ``distance`` (n,) metres and may have been rotated."""
-    variance = np.zeros((len(covariance), LENGTH))
-    variance[:, POSE] = np.concatenate([np.tile(distance[:, None], 3), np.full((len(covariance), 3), HAND)], axis=1)
-    return covariance + variance[:, :, None] ** 2 * np.eye(LENGTH)
+    deviation = np.zeros((len(covariance), LENGTH))
+    deviation[:, CENTRE], deviation[:, TURN] = distance[:, None], HAND
+    return covariance + deviation[:, :, None] ** 2 * np.eye(LENGTH)
 
 
 def rename_axes(

@@ -35,40 +35,26 @@ class TrackState(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """One body as known after a frame.
-
-    Attributes
-    ----------
-    id
-        Never used for another body.
-    superquadric : Superquadric
-        A single body in the world frame, in the same one of its forms as long as the track lives.
-    sigma_size : (3,)
-        Standard deviations of the half sizes, metres.
-    covariance : (11, 11)
-        Of a1 a2 a3 e1 e2 t1 t2 t3 (world frame) and the rotation vector in the object frame, metres and radians.
-    velocity : (3,)
-        Metres per second in the world frame; zero for bodies at rest.
-    seen
-        Number of observations.
-    state : TrackState
-    observation
-        Index of this frame's observation; None if there is none.
-    follows
-        Whether the body is as this frame observed it.  False where there is no observation, where its centre or
-        rotation is elsewhere and the track does not believe it yet, and where its sizes or exponents disagree for
-        more than one frame.
-    """
+    """One body as known after a frame."""
 
     id: int
+    """Never used for another body."""
     superquadric: Superquadric
+    """A single body in the world frame, in the same one of its forms as long as the track lives."""
     sigma_size: np.ndarray
+    """Standard deviations (3,) of the half sizes, metres."""
     covariance: np.ndarray
+    """(11, 11), of a1 a2 a3 e1 e2 t1 t2 t3 (world) and the rotation vector in the object frame, metres and radians."""
     velocity: np.ndarray
+    """(3,), metres per second in the world frame; zero for bodies at rest."""
     seen: int
+    """Number of observations."""
     state: TrackState
     observation: int | None
+    """Index of this frame's observation; None if there is none."""
     follows: bool
+    """Whether the body is as this frame observed it: not where its centre or rotation is elsewhere and the track does
+    not believe it yet, nor where its sizes or exponents disagree for more than one frame."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,24 +17,15 @@ from sq_perception.tracking.tracker import Track, Tracker
 
 
 class View(NamedTuple):
-    """What one camera shows.
-
-    Attributes
-    ----------
-    bodies
-        Recovered bodies in its optical frame, without failed ones:
-        :attr:`~sq_perception.recovery.recoverer.FrameRecovery.recovered`.
-    pose
-        Camera in the world that all share: 4 x 4, or (quaternion x y z w, translation).
-    camera : Camera, optional
-    depth : float (height, width), optional
-        Metres; with it, a body counts as missing only where this camera sees through its place.
-    """
+    """What one camera shows."""
 
     bodies: Iterable[Observed]
+    """In its optical frame, without failed ones: :attr:`~sq_perception.recovery.recoverer.FrameRecovery.recovered`."""
     pose: object
+    """Camera in the world that all share: 4 x 4, or (quaternion x y z w, translation)."""
     camera: Camera | None = None
     depth: np.ndarray | None = None
+    """(height, width), metres; with it, a body counts as missing only where this camera sees through its place."""
 
 
 def fuse_views(views: Iterable[View]) -> tuple[Track, ...]:

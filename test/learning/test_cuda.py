@@ -60,13 +60,13 @@ def test_a_run_goes_on(tmp_path: Path) -> None:
     assert next(checkpoint.load(tmp_path / "model.safetensors").parameters()).device.type == "cpu"
 
 
-@pytest.mark.parametrize("subject", [shard_training.THINGS, shard_training.MASKS], ids=lambda subject: subject.name)
-def test_a_run_on_shards_goes_on(tmp_path: Path, subject: shard_training.Subject) -> None:
-    draw, run = (draw_thing_views, THING_RUN) if subject is shard_training.THINGS else (draw_segment_views, MASK_RUN)
+@pytest.mark.parametrize("kind", [shard_training.THINGS, shard_training.MASKS], ids=lambda kind: kind.name)
+def test_a_run_on_shards_goes_on(tmp_path: Path, kind: shard_training.NetworkKind) -> None:
+    draw, run = (draw_thing_views, THING_RUN) if kind is shard_training.THINGS else (draw_segment_views, MASK_RUN)
     shard_training.write_views(tmp_path / "views", range(3), lambda rng: draw(4, rng), seed=1)
     config: ShardTraining = replace(run, minutes=0.05, batch=8, held=1, threads=1, device="cuda")
-    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    shard_training.train(kind, config, tmp_path / "views", tmp_path / "run")
     first = len((tmp_path / "run" / "log.jsonl").read_text().splitlines())
-    shard_training.train(subject, replace(config, minutes=0.1), tmp_path / "views", tmp_path / "run")
+    shard_training.train(kind, replace(config, minutes=0.1), tmp_path / "views", tmp_path / "run")
     assert len((tmp_path / "run" / "log.jsonl").read_text().splitlines()) > first
-    assert "device" in checkpoint.read_header(tmp_path / "run" / f"{subject.name}.safetensors")["made"]
+    assert "device" in checkpoint.read_header(tmp_path / "run" / f"{kind.name}.safetensors")["made"]

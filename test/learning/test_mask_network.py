@@ -42,15 +42,15 @@ def test_the_loss_is_a_weighted_cross_entropy() -> None:
     logits = torch.tensor([[[0.5, -1.0, 7.0]]])
     inside, beside = np.log1p(np.exp(-0.5)), np.log1p(np.exp(-1.0))
     expected = (inside + shard_training.AROUND * beside) / (1 + shard_training.AROUND)
-    assert float(shard_training.mask_loss(logits, images, truth)) == pytest.approx(expected, rel=1e-6)
-    assert float(shard_training.mask_loss(logits, images, torch.full_like(truth, UNKNOWN))) == 0
+    assert float(shard_training.mask_loss(logits, (images,), truth)) == pytest.approx(expected, rel=1e-6)
+    assert float(shard_training.mask_loss(logits, (images,), torch.full_like(truth, UNKNOWN))) == 0
 
 
 def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
-    subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
+    kind = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
     config = replace(MASK_RUN, minutes=0.1, batch=8, threads=1, held=1, validation=5)
-    network = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    network = shard_training.train(kind, config, tmp_path / "views", tmp_path / "run")
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert records[-1]["outliers"] == pytest.approx(1, abs=0.1)
     assert records[-1]["left"] < records[-1]["outliers"]
@@ -73,13 +73,13 @@ def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
         return original(none, paths)
 
     monkeypatch.setattr(shard_training, "read_views", read_views)
-    subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
+    kind = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
     config = replace(MASK_RUN, batch=2, threads=1, held=1, validation=1)
     for name, memory, expected in (("two", 2.5 * size, 2), ("one", 0.5 * size, 1)):
         read.clear()
         monkeypatch.setattr(shard_training, "_IN_MEMORY", memory)
         with pytest.raises(ArithmeticError, match="enough"):
-            shard_training.train(subject, config, tmp_path / "views", tmp_path / name)
+            shard_training.train(kind, config, tmp_path / "views", tmp_path / name)
         held, *pools = read
         assert held == ["00000"]
         assert {len(pool) for pool in pools} == {expected}
@@ -157,16 +157,16 @@ def test_a_shard_that_comes_before_those_held_is_trained_on(tmp_path: Path, rng:
         validated.append(views.truth)
         return {}
 
-    subject = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL), validate=validate)
+    kind = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL), validate=validate)
     config = replace(MASK_RUN, minutes=0.001, batch=2, threads=1, held=1)
-    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    shard_training.train(kind, config, tmp_path / "views", tmp_path / "run")
     (tmp_path / "later").rename(tmp_path / "views" / "00000.safetensors")
-    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    shard_training.train(kind, config, tmp_path / "views", tmp_path / "run")
     first, again = validated[0], validated[-1]
     np.testing.assert_array_equal(first, again)
     (tmp_path / "views" / "00001.safetensors").unlink()
     with pytest.raises(OSError, match=r"00001\.safetensors"):
-        shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+        shard_training.train(kind, config, tmp_path / "views", tmp_path / "run")
 
 
 def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:

@@ -156,11 +156,11 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator
         asked.append(views)
         shard_training.THINGS.finish(network, views)
 
-    subject = replace(shard_training.THINGS, network=lambda _: ThingNetwork(SMALL), finish=finish)
+    kind = replace(shard_training.THINGS, network=lambda _: ThingNetwork(SMALL), finish=finish)
     config = replace(THING_RUN, minutes=0.02, batch=8, held=1, validation=1, threads=1)
 
     def run(minutes: float) -> list[dict[str, Any]]:
-        shard_training.train(subject, replace(config, minutes=minutes), tmp_path / "views", tmp_path / "run")
+        shard_training.train(kind, replace(config, minutes=minutes), tmp_path / "views", tmp_path / "run")
         return [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
 
     first = run(0.02)
