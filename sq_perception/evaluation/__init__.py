@@ -1,4 +1,7 @@
-"""Pictures and figures of what was recovered; here is what an evaluation compares by default, importable at once."""
+"""Pictures and figures of what was recovered.
+
+What an evaluation compares by default is here, importable at once.
+"""
 
 from __future__ import annotations
 
