@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands import console
-from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
+from sq_perception.evaluation import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 from sq_perception.learning import training_config
 from sq_perception.learning.training_config import CHOICES, MASK_RUN, THING_RUN, ShardTraining, TrainingConfig
 

@@ -1,7 +1,4 @@
-"""Pictures of bodies from another place, shaded as matt solids on their support plane.
-
-They are rendered by the same ray casting as depth images, upright along the plane's normal where one is known.
-"""
+"""Pictures of bodies from another place, ray cast and shaded as matt solids on their support plane."""
 
 from __future__ import annotations
 

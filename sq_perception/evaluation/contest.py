@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sq_perception.evaluation import DEFAULT_SEED, FITS
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit
-from sq_perception.evaluation.protocol import DEFAULT_SEED, FITS
 from sq_perception.files.output_file import free_name
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric

@@ -1,7 +1,6 @@
 """Pictures of an evaluation: IoU and angles as histograms, and examples.
 
-Like :mod:`sq_perception.evaluation.plots`: figures of the Agg canvas, no global state.  True bodies are wires,
-predicted ones shaded.  Examples are chosen by their rank in IoU and by nothing else.
+True bodies are wires, predicted ones shaded.  Examples are chosen by their rank in IoU and by nothing else.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Parts of all pictures: figures and colours, the depth image, masks, reprojected outlines, grasps.
 
-Drawing functions take a Matplotlib axes; figures are made with the object interface and the Agg canvas, so that
-nothing here touches a display or a global state.  Images are in pixels with centres at integers, bodies in the optical
-frame.
-
-The silhouette of a body is drawn exactly, from its rendering.  Its edges (:func:`sq_perception.geometry.mesh.outline`)
-are solid where the camera sees them: on a convex body, where the normal points towards the camera.
+Figures are made with the object interface and the Agg canvas, so that nothing here touches a display or a global state.
+Images are in pixels with centres at integers, bodies in the optical frame.  Edges are solid where the camera sees them:
+on a convex body, where the normal points towards the camera.
 """
 
 from __future__ import annotations

@@ -179,7 +179,8 @@ def _degrees(radians: float) -> str:
     return f"{math.degrees(radians):.1f}°" if math.isfinite(radians) else "unknown"
 
 
-FORMAT, VERSION = "sq_perception.evaluation", 1
+FORMAT = "sq_perception.evaluation"
+VERSION = 1
 _CAPTIONS = {
     "distributions": "Left: IoU (figures 6.6, 7.3 and 7.7 of the thesis), bins of one per cent; where every body is "
     "above 95 %, that part only. Middle: the shortest arc as in figure 6.3, from the predicted to the label's "

@@ -118,6 +118,7 @@ _SINES = tuple(math.sin(math.pi * k / 6) for k in range(-3, 4))
 _SUPPORT_TOLERANCE = 1e-7
 """Error of the sine at which that search ends: the support is off by its square."""
 _TINY = 1e-145
+"""A number whose square is still a normal one."""
 
 
 @inline_kernel

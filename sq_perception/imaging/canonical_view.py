@@ -166,7 +166,9 @@ def from_mask(
     if find_hidden:
         read = mask & np.isfinite(depth)
         is_drawn = missing_is_hidden and bool((mask & ~read).any())  # not made of readings
-        lost = mask if is_drawn else np.ones_like(mask) if missing_is_hidden else _within_hull(read)
+        lost = mask if is_drawn else np.ones_like(mask)
+        if not missing_is_hidden:  # within the convex hull, whose own border passes outside of a convex set of pixels
+            lost = cv2.erode(regions.convex_hull(read.view(np.uint8)), np.ones((3, 3), np.uint8)).view(bool)
         ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
         nearer = _nearer(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
@@ -239,12 +241,6 @@ def _box(depth: np.ndarray, mask: np.ndarray, whole: bool) -> tuple[int, int, in
     if whole and inner_width > 0:
         return left, top, width, height
     return left + inner_left, top + inner_top, inner_width, inner_height
-
-
-def _within_hull(mask: np.ndarray) -> np.ndarray:
-    """The pixels (height, width) within the convex hull of a mask."""
-    # The hull's own border passes outside of a convex set of pixels.
-    return cv2.erode(regions.convex_hull(mask.view(np.uint8)), np.ones((3, 3), np.uint8)).view(bool)
 
 
 @kernel

@@ -16,9 +16,6 @@ taken, and frames say so.
 The camera is that of one topic (:mod:`sq_perception.recordings.bag_reader`): the message with the image's stamp;
 failing that, the last one before the image; failing that, the bag's first, however late.  The name of the images' topic
 decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
-
-A bag may be damaged or hostile (:mod:`sq_perception.recordings.bag_reader`); pixels are only allocated for data that
-is there.
 """
 
 from __future__ import annotations
@@ -147,11 +144,11 @@ class RecordedBag:
 
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
         try:
-            for found in self._pair():
+            for found in self._pair():  # pixels are only allocated for data that is there
                 if isinstance(found, FrameError):
                     yield found
-                else:
-                    yield from self._frame(*found)
+                elif not self._is_done(found[0].stamp):
+                    yield self._frame(*found)
         except FrameError as error:
             yield error
 
@@ -270,14 +267,11 @@ class RecordedBag:
             raise ValueError(f"mask: expected labels of the depth's shape {image.shape}, got {labels.shape}")
         return labels
 
-    def _frame(self, message: Message, info: Message | None) -> Iterator[RecordedFrame | FrameError]:
-        """Return the frame of an image, unless it is done."""
-        if self._is_done(message.stamp):
-            return
+    def _frame(self, message: Message, info: Message | None) -> RecordedFrame | FrameError:
         try:
-            yield self._decode(message, info)
+            return self._decode(message, info)
         except (ValueError, MemoryError) as error:
-            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {describe(error)}")
+            return FrameError(f"{self._path}: {self.topic} at {message.stamp}: {describe(error)}")
 
     def _decode(self, message: Message, info: Message | None) -> RecordedFrame:
         name, reading, warnings = frame_name(self._path, message.stamp), self._options.reading, []

@@ -1,7 +1,7 @@
 """The messages of a rosbag2 recording, by rosbags: bounded whatever the file claims, and errors in their place.
 
-A bag may be damaged or hostile.  Its message definitions are not used: they would become Python code, and the types
-read here are the same in every ROS 2.  What unpacks is bounded before it unpacks.
+The message definitions of a bag are not used: they would become Python code, and the types read here are the same in
+every ROS 2.
 
 Reference: rosbags, https://ternaris.gitlab.io/rosbags; MCAP, https://mcap.dev/spec
 
@@ -18,19 +18,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sq_perception.files.unpacking import UnpackingError, read_yaml
+from sq_perception.files.unpacking import MOST_BYTES, UnpackingError, read_yaml
 from sq_perception.imaging import compressed_depth
 from sq_perception.recordings import publication
 from sq_perception.recordings.frame_file import FrameError, Stamp
 
-LARGEST = 2**29
+LARGEST = MOST_BYTES
 """Bytes of one message, or of one unpacked chunk of messages."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_CUT = "end magic"
-"""A part of what rosbags says of an MCAP without its end."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
-"""What packed messages begin with; a plain one begins with the byte 0."""
+"""What a message that was packed by itself begins with; a plain one begins with the byte 0."""
 _COLOUR = re.compile(r"colou?r|rgb(?!d)")
 
 
@@ -143,7 +141,8 @@ class BagReader:
                 if limit is not None and before // every == limit:
                     return
             try:
-                content: Any = self._types.deserialize_cdr(_plain(data), connection.msgtype)
+                plain = _unpack(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
+                content: Any = self._types.deserialize_cdr(plain, connection.msgtype)
                 stamp = Stamp(int(content.header.stamp.sec), int(content.header.stamp.nanosec))
             except Exception as error:  # whatever damaged bytes lead to
                 recorded = Stamp(*divmod(nanoseconds, 10**9))
@@ -173,11 +172,12 @@ def _open(path: Path) -> tuple[Any, Any]:
         reader = rosbag2.Reader(path)
         reader.open()
     except Exception as error:  # whatever damaged files lead to
-        cut = " (of a recording that was cut short, mcap recover saves what is there)" * (_CUT in str(error).lower())
+        is_cut = "end magic" in str(error).lower()  # as rosbags says of an MCAP without its end
+        cut = " (of a recording that was cut short, mcap recover saves what is there)" * is_cut
         raise FrameError(f"{path}: not a readable bag: {describe(error)}{cut}") from error
     storages: list[Any] = [reader.storage]
     if isinstance(reader.storage, rosbag2.reader.DirectoryReader):
-        # Messages packed one by one would be unpacked without a bound; so they come as they are, for _plain.
+        # Messages packed one by one would be unpacked without a bound; so they come as they are, and are unpacked here.
         reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
         storages = reader.storage.storages
     for storage in storages:
@@ -197,11 +197,6 @@ def _refuse_packed_files(folder: Path) -> None:
         raise FrameError(f"{folder}: metadata.yaml: expected rosbag2_bagfile_information")
     if str(information.get("compression_mode", "")).lower() == "file":
         raise FrameError(f"{folder}: packed as whole files: unpack them (zstd -d) and name the .mcap or .db3 file")
-
-
-def _plain(data: bytes) -> bytes:
-    """Return a message's bytes, unpacked where it was packed by itself."""
-    return _unpack(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
 
 
 def _unpack(data: bytes, size: int) -> bytes:

@@ -15,7 +15,6 @@ import numpy as np
 
 from sq_perception.files.unpacking import LONGEST_TEXT, UnpackingError, npy_array, npz_arrays, yaml_documents
 
-_SHAPES = {4: (4,), 9: (3, 3), 12: (3, 4), 16: (4, 4)}
 _COLMAP = re.compile(r"\s*(\d+)\s+([A-Z]\w+)\s+(\d+)\s+(\d+)((?:\s+[-+.\deE]+)+)\s*")
 _COLMAP_PARAMETERS = {
     "SIMPLE_PINHOLE": "f cx cy",
@@ -77,7 +76,7 @@ def _of_numbers(text: str) -> dict[str, Any] | None:
 
 def _matrix(numbers: np.ndarray) -> dict[str, Any]:
     """Return K, or the larger matrix around it, or four numbers."""
-    shape = _SHAPES.get(numbers.size)
+    shape = {4: (4,), 9: (3, 3), 12: (3, 4), 16: (4, 4)}.get(numbers.size)
     if shape is None or numbers.dtype.kind not in "fiu" or numbers.shape not in (shape, (numbers.size,)):
         raise ValueError(f"expected four numbers (fx fy cx cy) or 3 x 3 of them, got {numbers.dtype} {numbers.shape}")
     return {"k": numbers.reshape(shape).tolist()}

@@ -39,7 +39,7 @@ UNORGANISED = (
 
 
 class Cloud(NamedTuple):
-    """Points (height, width, 3), one row where they are not organised, NaN for none; and int32 labels, if any."""
+    """Points (height, width, 3), one row where they are not organised, NaN for none; and labels (height, width)."""
 
     points: np.ndarray
     labels: np.ndarray | None
@@ -111,14 +111,13 @@ def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage
     Raises UnpackingError if they do not lie before a camera in the origin that looks along z.
     """
     least = 100
-    with np.errstate(invalid="ignore"):
+    with np.errstate(all="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
         before = there & (points[..., 2] > LEAST_DEPTH) & (points[..., 2] < GREATEST_DEPTH)
-    count = int(np.count_nonzero(there))
-    with np.errstate(all="ignore"):
         # 60 degrees off the axis, the edge of the widest images: one point beside the camera, as in clouds of several
         # views, would leave no pixels for all others.
         near = before & (np.abs(points[..., :2]).max(axis=2) < 1.75 * points[..., 2])
+    count = int(np.count_nonzero(there))
     behind, off = (float(np.count_nonzero(some)) / max(count, 1) for some in (there & ~before, before & ~near))
     expected = (
         f"expected {least} points or more, most of them before the camera: x right, y down, z forward from it; "
@@ -200,11 +199,7 @@ def _seen(tangents: np.ndarray, z: np.ndarray, labels: np.ndarray | None) -> Clo
     return CloudImage(depth, camera, shown, False)
 
 
-_Parts = tuple[np.ndarray, np.ndarray | None]
-"""Points (height, width, 3) and labels (height, width) of a file, as it has them."""
-
-
-def _npz(path: Path) -> _Parts:
+def _npz(path: Path) -> Cloud:
     fields = npz_arrays(path, ("points", "labels"))
     points, labels = fields["points"], fields.get("labels")
     if points.dtype.kind not in "fiu" or points.ndim not in (2, 3) or points.shape[-1] != 3:
@@ -212,10 +207,10 @@ def _npz(path: Path) -> _Parts:
     if labels is not None and (labels.dtype.kind not in "fiub" or labels.shape != points.shape[:-1]):
         raise UnpackingError(f"labels: expected numbers {points.shape[:-1]}, got {labels.dtype} {labels.shape}")
     points = points[None] if points.ndim == 2 else points
-    return points, None if labels is None else labels.reshape(points.shape[:2])
+    return Cloud(points, None if labels is None else labels.reshape(points.shape[:2]))
 
 
-def _ply(path: Path) -> _Parts:
+def _ply(path: Path) -> Cloud:
     import trimesh
 
     found: Any = trimesh.load(path, file_type="ply", process=False)
@@ -223,10 +218,10 @@ def _ply(path: Path) -> _Parts:
     data = found.metadata.get("_ply_raw", {}).get("vertex", {}).get("data", {})
     names = data.dtype.names if isinstance(data, np.ndarray) else data
     name = next((name for name in LABEL_FIELDS if name in names), None)
-    return points[None], None if name is None else np.asarray(data[name]).reshape(1, len(points))
+    return Cloud(points[None], None if name is None else np.asarray(data[name]).reshape(1, len(points)))
 
 
-def _pcd(path: Path) -> _Parts:
+def _pcd(path: Path) -> Cloud:
     data = path.read_bytes()
     head: dict[str, list[str]] = {}
     at = 0
@@ -243,14 +238,14 @@ def _pcd(path: Path) -> _Parts:
     field = next((name for name in LABEL_FIELDS if name in head["FIELDS"]), None)
     where = [head["FIELDS"].index(name) for name in ("x", "y", "z", *([field] if field else []))]
 
-    def parts(columns: list[np.ndarray]) -> _Parts:
+    def cloud(columns: list[np.ndarray]) -> Cloud:
         labels = columns[3].reshape(height, width) if field else None
-        return np.stack(columns[:3], axis=1).reshape(height, width, 3), labels
+        return Cloud(np.stack(columns[:3], axis=1).reshape(height, width, 3), labels)
 
     if head["DATA"] == ["ascii"]:
         columns = np.cumsum([0, *counts])
         table = np.array(data[at:].split(), dtype=float).reshape(count, columns[-1])
-        return parts([table[:, columns[k]] for k in where])
+        return cloud([table[:, columns[k]] for k in where])
     layout = np.dtype([(f"{k}", kind, (number,)) for k, (kind, number) in enumerate(zip(kinds, counts, strict=True))])
     if head["DATA"] == ["binary_compressed"]:
         # Packed column by column: all x, then all y.
@@ -261,11 +256,11 @@ def _pcd(path: Path) -> _Parts:
         if not _unpack(np.frombuffer(data, np.uint8, packed, at + 8), unpacked):
             raise UnpackingError("expected bytes that LZF packed")
         ends = count * np.cumsum([0, *(layout[k].itemsize for k in range(len(kinds)))])
-        return parts([unpacked[ends[k] : ends[k + 1]].view(kinds[k]).reshape(count, counts[k])[:, 0] for k in where])
+        return cloud([unpacked[ends[k] : ends[k + 1]].view(kinds[k]).reshape(count, counts[k])[:, 0] for k in where])
     if head["DATA"] != ["binary"]:
         raise UnpackingError(f"DATA: expected ascii, binary or binary_compressed, got {' '.join(head['DATA'])}")
     rows = np.frombuffer(data, layout, count, at)
-    return parts([rows[f"{k}"][:, 0] for k in where])
+    return cloud([rows[f"{k}"][:, 0] for k in where])
 
 
 @kernel

@@ -14,13 +14,9 @@ before all others.  A file whose name is a time, such as 1305031102.160407.png, 
 exactly this form are those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre.  A camera_info is a YAML, or
 one of the forms of :mod:`sq_perception.recordings.camera_file`; where none is named, the one beside the image counts.
 
-The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w)
-and the text "orthographic" as ``projection``, which goes before the caller's.  Nothing in a file is executed: no
-pickle, plain YAML only; and nothing is unpacked that is larger than any camera's image.
-
-Whether a PNG is raw and its distortion has to be undone is decided by :mod:`sq_perception.imaging.calibration`.
-
-Whole folders and rosbags are read by :mod:`sq_perception.recordings.inputs`, frame by frame, into the same class.
+The cube is that of :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w) and the text
+"orthographic" as ``projection``, which goes before the caller's.  Whether an image is raw and its distortion has to be
+undone is decided by :mod:`sq_perception.imaging.calibration`.
 """
 
 from __future__ import annotations
@@ -320,9 +316,7 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
         if labels.shape != depth.shape or labels.dtype.kind not in "iub":
             expected = f"expected integers of the depth's shape {depth.shape}"
             raise ValueError(f"labels: {expected}, got {labels.dtype} {labels.shape}")
-        if labels.max() > np.iinfo(np.int32).max:
-            raise ValueError(f"labels: expected numbers below 2^31, got {labels.max()}")
-        labels = np.maximum(labels, 0).astype(np.int32)
+        labels = cloud_file.labels_of(labels)
     height, width = depth.shape
     is_cube = str(fields.get("projection", "")) == "orthographic"
     if projection == "orthographic" or is_cube:

@@ -1,11 +1,8 @@
 """Results of recorded frames as one HTML file: points, bodies and numbers, for any browser, without a server.
 
-The file is complete in itself: its script draws with WebGL, and its content security policy forbids the browser to load
-anything.  A frame is one line of JSON, which grows the file as the run goes; bodies are written as their parameters and
-meshed by the page.  Everything that is drawn is in metres in the optical frame; the numbers are those of the other
-results.
-
-Points are quantised to 16 bits along each axis of the box around them: 0.1 mm in a scene of six metres.
+Its script draws with WebGL, and its content security policy forbids the browser to load anything.  A frame is one line
+of JSON; bodies are written as their parameters and meshed by the page.  What is drawn is in metres in the optical
+frame.  Points are quantised to 16 bits along each axis of the box around them: 0.1 mm in a scene of six metres.
 """
 
 from __future__ import annotations

@@ -16,11 +16,9 @@ before, the first one at INTERVAL, as time 0 means "unknown" in ROS: the same in
 was no message has the frame id of the synthetic camera.  Messages are logged when the bag received the image; failing
 that, at the stamp.
 
-The package mcap writes the file, chunk by chunk, whatever the length of the recording.  An interrupted run leaves a
-whole file of fewer frames; a full disk leaves one without an index, from which ``mcap recover`` makes a file.
-
-Messages are rosbags' classes, which want every field and arrays of numbers as NumPy has them; ROS has defaults and
-takes lists.  References: MCAP, https://mcap.dev/spec; rosbags, https://ternaris.gitlab.io/rosbags
+An interrupted run leaves a whole file of fewer frames; a full disk leaves one without an index, from which
+``mcap recover`` makes a file.  Messages are rosbags' classes, which want every field and arrays of numbers as NumPy has
+them; ROS has defaults and takes lists.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
 ``result.schema.json`` beside this file describes the document, and every field in it.  Coordinates are metres in the
 optical frame, or those of the unit cube.  A file of JSON lines has its head without ``frames`` in its first line, and
-in each line that follows an element of ``frames``.  Such a file grows; a line that an end of the program cut short is
-taken away when it is opened again, and nothing is added to what other options have found.
+in each line that follows an element of ``frames``.  A last line that was cut short is taken away when the file is
+opened again, and nothing is added to what other options have found.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Followed
 from sq_perception.tracking.tracker import Track
 
-FORMAT, VERSION = "sq_perception.recovery", 1
+FORMAT = "sq_perception.recovery"
+VERSION = 1
 UNITS = {"optical": "m", "cube": "1"}
 """Units of lengths, by a frame's coordinates."""
 LARGEST = 2**30
@@ -189,9 +190,8 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
 class ResultLines:
     """A file of JSON lines that grows frame by frame; close it when all is done.  A stream is written to as it is.
 
-    ``options`` are those that decide what is found; ``done`` has the elements of ``frames`` that were there before.
-    Raises ResumeError if there is a file of something else, or of other options; OSError if it cannot be written, or
-    another program is writing it.
+    ``done`` has the elements of ``frames`` that were there before.  Raises ResumeError if there is a file of something
+    else, or of other options; OSError if it cannot be written, or another program is writing it.
     """
 
     def __init__(self, path: str | Path, options: Mapping[str, Any]) -> None:

@@ -218,7 +218,6 @@ def test_a_body_is_recovered_through_a_lens(raw, lens):
     reference, _ = recovered_sizes(ideal, raw, np.isfinite(ideal))
     sizes, found = recovered_sizes(undone.there.depth(seen), undone.camera, undone.there.labels(mask))
     ignored, _ = recovered_sizes(seen, raw, mask)
-    print(f"ideal {reference / true - 1}, rectified {sizes / true - 1}, ignored {ignored / true - 1}")
     np.testing.assert_allclose(reference, true, rtol=0.01)
     np.testing.assert_allclose(sizes, true, rtol=0.002 * COARSE)
     np.testing.assert_allclose(found.translation, BODY.translation, atol=2e-4)

@@ -64,18 +64,11 @@ def packed(grey: np.ndarray, stamp: float) -> Any:
 
 
 def info(stamp: float, k: np.ndarray = K, size: tuple[int, int] = (160, 120), distortion: float = 0.0) -> Any:
+    whole = T["RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     return T["CameraInfo"](
-        header=header(stamp),
-        height=size[1],
-        width=size[0],
-        distortion_model="plumb_bob",
-        d=np.array([distortion, 0, 0, 0, 0.0]),
-        k=k.ravel(),
-        r=np.eye(3).ravel(),
-        p=np.hstack([k, np.zeros((3, 1))]).ravel(),
-        binning_x=0,
-        binning_y=0,
-        roi=T["RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+        header=header(stamp), height=size[1], width=size[0], distortion_model="plumb_bob",
+        d=np.array([distortion, 0, 0, 0, 0.0]), k=k.ravel(), r=np.eye(3).ravel(),
+        p=np.hstack([k, np.zeros((3, 1))]).ravel(), binning_x=0, binning_y=0, roi=whole,
     )
 
 
