@@ -67,7 +67,7 @@ def support(
         return top
     if not behind and -reach <= low < _HOVERING:
         return found.plane
-    depth, valid = segments.measured(depth, camera, options.depth_range)
+    depth, valid = segments.select_readings(depth, camera, options.depth_range)
     other = support_plane.around(found.labels, (obj.label,), depth, valid, camera, found.plane)
     if other is not None:
         lowest, middle = obj.levels(other.equation)

@@ -76,7 +76,7 @@ class FrameEvidence:
             return np.zeros(self.labels.shape, bool)
         return (self.labels > 0) & (self.membership < 0.5)
 
-    def likely(self) -> dict[int, float]:
+    def objectness_by_label(self) -> dict[int, float]:
         """The probability that each object is a thing, by its label."""
         return dict(zip(self.ids, self.objectness or (1.0,) * len(self.ids), strict=True))
 
@@ -86,7 +86,7 @@ class FrameEvidence:
             return {}
         return dict(zip(self.ids, self.affinity[self.ids.index(label)].tolist(), strict=True))
 
-    def kept(self, likely: dict[int, float]) -> FrameEvidence:
+    def keep(self, likely: dict[int, float]) -> FrameEvidence:
         """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""
         if tuple(likely) == self.ids == tuple(range(1, len(self.ids) + 1)):
             return replace(self, objectness=tuple(likely.values()))

@@ -23,14 +23,12 @@ from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.options import POINTS, TURNS, across
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat, noise_growth
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat_surface, noise_growth
 
 _LOWEST = 5.0
 """Tolerances above the support at which a face lies at least: lower ones are books and bumps."""
 _LAYER = 0.7
 """Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
-_FEWEST = 30
-"""Points of a face, of some hundred of its segment."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +60,7 @@ def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -
     return {k: regions.some_points(*regions.pixels(labels, k, extents[k]), depth, camera, POINTS) for k in order}
 
 
-def found(
+def find_faces(
     segments: Mapping[int, np.ndarray], labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface,
     least: int,
 ) -> list[LevelFace]:
@@ -86,14 +84,14 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     reach = TOLERANCE * quantile(growth, 0.5)
     ordered = np.sort(height[height >= _LOWEST * reach])
     level = ordered[densest(ordered, reach)]
-    if len(level) < _FEWEST:
+    if not len(level):
         return None
     at = float(np.median(level))
     off = (height - at) / growth
     on = np.abs(off) < TOLERANCE
     count = np.count_nonzero(on)
     within, above = (int(np.count_nonzero(some)) for some in (np.abs(off) < 2 * TOLERANCE, off > TOLERANCE))
-    if count < max(_FEWEST, _LAYER * within, above):
+    if count < max(_LAYER * within, above):
         return None
     sigma = max(support.sigma, deviation(np.abs(off[on])))
-    return flat(Plane(support.plane.equation - np.array([0, 0, 0, at]), count / len(points), sigma))
+    return flat_surface(Plane(support.plane.equation - np.array([0, 0, 0, at]), count / len(points), sigma))

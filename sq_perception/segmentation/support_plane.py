@@ -263,12 +263,12 @@ class SupportSurface:
         return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
 
 
-def flat(plane: Plane) -> SupportSurface:
+def flat_surface(plane: Plane) -> SupportSurface:
     """A plane that is not known to be bent."""
     return SupportSurface(plane, np.zeros(6), 0.0, plane.sigma)
 
 
-def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
+def fit_surface(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
     """The surface that a plane was seen as.
 
     Parameters
@@ -286,12 +286,12 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     height = plane.height(points) / growth
     on = np.abs(height) < TOLERANCE
     if not on.any():
-        return flat(plane)
+        return flat_surface(plane)
     limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     for _ in range(6):
         if np.count_nonzero(on) < 10 * len(terms):
-            return flat(plane)
+            return flat_surface(plane)
         bend = np.linalg.lstsq((terms * on) @ terms.T, terms @ (on * height), rcond=None)[0]
         off, last = np.abs(height - np.clip(bend @ terms, -limit, limit)), on
         on = off < TOLERANCE

@@ -24,7 +24,7 @@ from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.support_plane import Plane, flat
+from sq_perception.segmentation.support_plane import Plane, flat_surface
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -249,7 +249,7 @@ def test_parting_segments_makes_no_more_objects_than_are_wanted(monkeypatch):
     for k in range(3):
         labels[10:30, 10 + 15 * k : 20 + 15 * k] = k + 1
     parted = FrameEvidence(labels, (1, 2, 3))
-    monkeypatch.setattr(own_segments.SegmentNetwork, "improved", lambda *_: parted)
+    monkeypatch.setattr(own_segments.SegmentNetwork, "improve", lambda *_: parted)
     camera = Camera(64, 48, 60.0, 60.0, 32, 24)
     found = Recoverer().recover(np.ones((48, 64), np.float32), camera, options=RecoveryOptions(max_objects=2))
     assert [body.label for body in found.bodies] == [1, 2]
@@ -263,9 +263,9 @@ def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
     depth, truth = table.see([table.body(-0.1, 0, (0.06, 0.06, 0.05)), table.body(0.12, 0, (0.03, 0.03, 0.03))])
 
     def without_the_largest(_, found):
-        return found.kept(dict.fromkeys(found.ids[1:], 1.0))
+        return found.keep(dict.fromkeys(found.ids[1:], 1.0))
 
-    monkeypatch.setattr(own_segments.SegmentNetwork, "improved", without_the_largest)
+    monkeypatch.setattr(own_segments.SegmentNetwork, "improve", without_the_largest)
     found = Recoverer().recover(depth, VGA, options=RecoveryOptions(max_objects=1))
     assert [body.label for body in found.bodies] == [1]
     assert np.mean(truth[found.labels == 1] == 2) > 0.95
@@ -345,9 +345,9 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     assert small.sum() > 200
     found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
     assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
-    given = FrameEvidence(small, (1,), flat(Plane(scene.plane, 1.0, 1e-3)))
+    given = FrameEvidence(small, (1,), flat_surface(Plane(scene.plane, 1.0, 1e-3)))
     (obj,) = seen_object.objects(depth, given, CAMERA)
-    whole = seen_object.completed(replace(obj, plane=scene.plane), depth, CAMERA, small)
+    whole = seen_object.complete(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()
     assert (whole.mask & ~obj.mask).any() == (pixels > 0)
 

@@ -49,12 +49,12 @@ def supported(depth):
     """The support of an image, and its depth with 0 where there is none."""
     valid = np.isfinite(depth)
     known = np.where(valid, depth, np.float32(0))
-    return support_plane.measured(support_plane.support(depth, valid, VGA), known, valid, VGA), known
+    return support_plane.fit_surface(support_plane.support(depth, valid, VGA), known, valid, VGA), known
 
 
 def faces(labels, known, support):
     segments = level_faces.samples(labels, known, VGA, 100)
-    return level_faces.found(segments, labels, known, VGA, support, 100)
+    return level_faces.find_faces(segments, labels, known, VGA, support, 100)
 
 
 @pytest.mark.parametrize("seed", range(3))
