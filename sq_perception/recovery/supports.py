@@ -31,8 +31,6 @@ _HIGHEST_STACK = 0.5
 """Higher above its plane, metres, an object does not even stand on others that stand on it."""
 _FEET = 0.01
 """Metres above the lowest pixels that are an object's feet."""
-_FEWEST = 15
-"""Points of a top, of some thousand of its object."""
 _NOT_ON_IT = 0.1
 """Metres above its plane from which on what is beside an object may hold it."""
 _HELD = 0.15
@@ -112,12 +110,10 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
         points = other.points
         heights = points @ plane[:3] + plane[3]
         ordered = np.sort(heights[heights < low + 2 * reach])
-        if len(ordered) < _FEWEST:
+        if not len(ordered):
             continue
         height = float(np.median(ordered[densest(ordered, reach)]))
         top = _seen_from_above(points[np.abs(heights - height) < reach], axes)
-        if len(top) < _FEWEST:
-            continue
         hull = cv2.convexHull(top)
         inside = np.median([cv2.pointPolygonTest(hull, foot, True) for foot in feet.tolist()])
         if inside > 0:

@@ -15,11 +15,11 @@ import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_plane import SupportSurface
+from sq_perception.segmentation.support_plane import LEAST_SIGMA, SupportSurface
 
-LEAST_SIGMA, UNKNOWN_SIGMA = 5e-4, 1.5e-3
-"""Noise of the depth at one metre, metres: what is assumed at least, as rendered images have none, and where no support
-shows it, that of structured light (Khoshelham and Oude Elberink, Sensors 2012)."""
+UNKNOWN_SIGMA = 1.5e-3
+"""Noise of the depth at one metre, metres, where no support shows it: that of structured light (Khoshelham and Oude
+Elberink, Sensors 2012)."""
 
 
 @dataclass(frozen=True, eq=False)

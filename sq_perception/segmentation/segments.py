@@ -34,10 +34,10 @@ from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import container_walls, convex_parts, level_faces, objectness, support_plane
-from sq_perception.segmentation.evidence import LEAST_SIGMA, UNKNOWN_SIGMA, FrameEvidence
+from sq_perception.segmentation.evidence import UNKNOWN_SIGMA, FrameEvidence
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, LARGEST_THING, POINTS, SegmentationOptions, largest_edge
-from sq_perception.segmentation.support_plane import CLEARLY, TOLERANCE, SupportSurface
+from sq_perception.segmentation.support_plane import CLEARLY, LEAST_SIGMA, TOLERANCE, SupportSurface
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m."""

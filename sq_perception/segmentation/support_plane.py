@@ -46,6 +46,8 @@ far from all planes, it says nothing."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
+LEAST_SIGMA = 5e-4
+"""Noise of the depth at one metre, metres, that is assumed at least: rendered images have none."""
 CLEARLY = 4.0
 """Standard deviations of the noise from which on a height is none of it."""
 _DISTORTION = 0.02
