@@ -118,9 +118,10 @@ class SampledImage:
         ``count``."""
         rows, columns = regions.pixels(self.labels, samples.label, extent)
         block = max(1, stride(len(rows), count) // 4)
-        by_group = samples.pixels, samples.z, group, int(group.max()) + 1
-        seen = self.depth, self.focal, samples.spacing, block, self.noise, self.least
-        chosen = _assign(rows, columns, *by_group, *seen)
+        chosen = _assign(
+            rows, columns, samples.pixels, samples.z, group, int(group.max()) + 1, self.depth, self.focal,
+            samples.spacing, block, self.noise, self.least,
+        )
         pieces = [(rows[chosen == k], columns[chosen == k]) for k in range(int(group.max()) + 1)]
         return [piece for piece in pieces if len(piece[0])]
 

@@ -90,8 +90,8 @@ def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] 
     if np.count_nonzero(valid) < least:
         return FrameEvidence(np.zeros(depth.shape, np.int32))
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
-    is_silhouette, seen = _is_silhouette(valid), np.nonzero(valid)
-    if is_silhouette and largest_edge(regions.some_points(*seen, known, camera, POINTS)) <= LARGEST_THING:
+    is_silhouette, (rows, columns) = _is_silhouette(valid), np.nonzero(valid)
+    if is_silhouette and largest_edge(regions.some_points(rows, columns, known, camera, POINTS)) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
     plane = support_plane.support(depth, valid, camera)
     if plane is None:
@@ -100,8 +100,8 @@ def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] 
     relative = support.image_relative(known, camera)
     labels = _find_raised(known, camera, relative, valid, support)
     tops = level_faces.samples(labels, known, camera, least)
-    for face in level_faces.find_faces(tops, labels, known, camera, support, least):
-        labels = _unload(labels, face, known, camera, least)
+    for label, face in level_faces.find_faces(tops, labels, known, camera, support, least).items():
+        labels = _unload(labels, label, face, known, camera, least)
     around = container_walls.walls(tops, plane.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
     found = _order(FrameEvidence(labels, support=support), least)
@@ -231,13 +231,13 @@ def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least
 
 
 def _unload(
-    labels: np.ndarray, face: level_faces.LevelFace, known: np.ndarray, camera: Camera, least: int
+    labels: np.ndarray, label: int, face: SupportSurface, known: np.ndarray, camera: Camera, least: int
 ) -> np.ndarray:
-    """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
-    relative = face.surface.image_relative(known, camera)
-    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    parts = _order(FrameEvidence(_find_raised(known, camera, relative * valid, valid, face.surface)), least)
-    heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.surface.sigma)
+    """Labels in which what stands on the level face of a segment has its own, found with the face as support."""
+    relative = face.image_relative(known, camera)
+    valid = level_faces.find_above(label, face, labels, known, camera) & (relative > -TOLERANCE)
+    parts = _order(FrameEvidence(_find_raised(known, camera, relative * valid, valid, face)), least)
+    heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.sigma)
     parts = judge(replace(parts, heights=heights))
     return np.where(parts.labels > 0, parts.labels + labels.max(), labels)
 
