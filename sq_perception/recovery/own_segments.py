@@ -89,7 +89,7 @@ class SegmentNetwork:
     max_size: float = LARGEST_THING
 
     def improve(self, found: FrameEvidence) -> FrameEvidence:
-        """Segments parted, joined, with their outliers, without those of nothing; labels from 1, the largest first."""
+        """Part and join segments, find their outliers, and drop those of nothing; labels from 1, the largest first."""
         if not found.ids:
             return found
         labels = found.labels.copy()

@@ -175,7 +175,7 @@ def objects(depth: np.ndarray, found: FrameEvidence, camera: Camera) -> list[See
 
 
 def complete(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.ndarray) -> SeenObject:
-    """The object with a mask that was given some pixels too small completed; any other object as it is.
+    """Return the object with a mask that was given some pixels too small completed; any other object as it is.
 
     Such a mask goes on nearly all around without a depth step, while beside a right one there is the support, what is
     far behind, or another object.  Uncompleted, the missing pixels would pass for free space beside the object, and the
@@ -217,7 +217,7 @@ def surroundings(
 def add_views(
     obj: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
 ) -> SeenObject:
-    """The object with ``shown``, the view for a network of this configuration, and ``view``, that for its score."""
+    """Return the object with ``shown``, the view for a network of this configuration, and ``view``, for its score."""
     inner = core(obj, depth, camera)
     shown = None
     if config is not None:

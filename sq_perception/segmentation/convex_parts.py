@@ -53,7 +53,7 @@ _ALONG = 0.15
 
 
 def correct(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
-    """Segments taken apart where they are several convex bodies, and joined where they are one.
+    """Take segments apart where they are several convex bodies, and join them where they are one.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def _crossed_between(
 
 
 def cluster(crossed: np.ndarray, far: np.ndarray, limit: float, least: float) -> np.ndarray:
-    """Groups (n,) of samples, from 0, by whether lines between them (n, n) are crossed, and by their distance; what
+    """Group samples, numbers (n,) from 0, by whether lines between them (n, n) are crossed, and by their distance; what
     has less than ``least`` samples joins the group that it is nearest to."""
     group = link(crossed + _METRIC * far / max(far.max(), 1e-9), limit)
     keep = np.flatnonzero(np.bincount(group)[group] >= least)
@@ -195,7 +195,7 @@ def cluster(crossed: np.ndarray, far: np.ndarray, limit: float, least: float) ->
 
 
 def link(distance: np.ndarray, limit: float) -> np.ndarray:
-    """Groups (n,) from 0 by average linkage: the two nearest are joined until none of (n, n) are nearer than a limit.
+    """Group by average linkage, numbers (n,) from 0: join the two nearest until none of (n, n) are nearer than a limit.
 
     inf is no distance: that of the other one holds.
     """

@@ -87,7 +87,7 @@ class FrameEvidence:
         return dict(zip(self.ids, self.affinity[self.ids.index(label)].tolist(), strict=True))
 
     def keep(self, likely: dict[int, float]) -> FrameEvidence:
-        """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""
+        """Keep the objects of some labels, with their probabilities to be things; renumbered from 1, largest first."""
         if tuple(likely) == self.ids == tuple(range(1, len(self.ids) + 1)):
             return replace(self, objectness=tuple(likely.values()))
         counts = regions.extents(self.labels)[:, 0]

@@ -42,8 +42,8 @@ def find_faces(
     segments: Mapping[int, np.ndarray], labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface,
     least: int,
 ) -> dict[int, SupportSurface]:
-    """The level faces, as supports, of the segments that have one, and at least ``least`` pixels above it; in the order
-    of ``segments``, samples of what stands on the ``support``."""
+    """Find the level faces, as supports, of the segments that have one, and at least ``least`` pixels above it; in the
+    order of ``segments``, samples of what stands on the ``support``."""
     extents, faces = regions.extents(labels), {}
     for label, points in segments.items():
         if (face := _face(points, support)) is not None:
@@ -58,7 +58,7 @@ def find_faces(
 def find_above(
     label: int, face: SupportSurface, labels: np.ndarray, depth: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Pixels, bool (height, width), of a segment with a level face and of all whose middle is right above it."""
+    """Find the pixels (height, width) of a segment with a level face and of all whose middle is right above it."""
     axes = TURNS @ across(face.plane.equation[:3]).T
     some = samples(labels, depth, camera, 1)
     low, high = (axes @ some[label].T).min(axis=1), (axes @ some[label].T).max(axis=1)

@@ -92,7 +92,7 @@ class SampledImage:
         return math.sqrt(self.camera.fx * self.camera.fy)
 
     def sample(self, label: int, extent: np.ndarray, count: int) -> Samples | None:
-        """Some ``count`` samples of a segment; None where they are too few to say anything."""
+        """Take some ``count`` samples of a segment; None where they are too few to say anything."""
         size, top, bottom, left, right = extent.tolist()
         step = stride(size, count)
         top, left = (first + (step // 2 - first) % step for first in (top, left))

@@ -82,7 +82,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
 
 
 def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> FrameEvidence:
-    """Segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
+    """Find segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
     depth, valid = select_readings(depth, camera, depth_range)
     least = least_pixels(depth.size)
     if not camera.is_pinhole:
@@ -111,8 +111,8 @@ def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] 
 
 
 def judge(found: FrameEvidence, medians: Mapping[int, float] | None = None) -> FrameEvidence:
-    """Segments that are things by their heights, and by the median logits of a network that saw all of them; where
-    there is no support, all."""
+    """Keep segments that are things by their heights, and by the median logits of a network that saw them; where there
+    is no support, all of them."""
     likely = dict.fromkeys(found.ids, 1.0)
     if found.heights is not None:
         rise = found.heights.rise(found.labels, found.ids).tolist()
@@ -122,7 +122,7 @@ def judge(found: FrameEvidence, medians: Mapping[int, float] | None = None) -> F
 
 
 def limit(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> FrameEvidence:
-    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
+    """Keep segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
     depth, valid = select_readings(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
     larger, outside = set(), set()
@@ -202,7 +202,7 @@ def warm_up() -> None:
 
 
 def select_readings(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """The depth, float32, and where it is a measurement within limits."""
+    """Return the depth, float32, and where it is a measurement within limits."""
     depth = camera.readings(depth).astype(np.float32, copy=False)
     near, far = limits
     valid = np.isfinite(depth) if np.isinf(far) else depth <= far
@@ -233,7 +233,7 @@ def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least
 def _unload(
     labels: np.ndarray, label: int, face: SupportSurface, known: np.ndarray, camera: Camera, least: int
 ) -> np.ndarray:
-    """Labels in which what stands on the level face of a segment has its own, found with the face as support."""
+    """Give what stands on the level face of a segment labels of its own, found with the face as support."""
     relative = face.image_relative(known, camera)
     valid = level_faces.find_above(label, face, labels, known, camera) & (relative > -TOLERANCE)
     parts = _order(FrameEvidence(_find_raised(known, camera, relative * valid, valid, face)), least)
@@ -243,7 +243,7 @@ def _unload(
 
 
 def _order(found: FrameEvidence, least: int) -> FrameEvidence:
-    """The largest segments of at least so many pixels."""
+    """Keep the largest segments of at least so many pixels."""
     counts = regions.extents(found.labels)[:, 0]
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
@@ -253,7 +253,7 @@ def _order(found: FrameEvidence, least: int) -> FrameEvidence:
 def _find_raised(
     known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
 ) -> np.ndarray:
-    """Bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
+    """Find bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
 
     ``known`` and ``relative`` (height, width) are depth, and height above the support as at one metre of depth, both 0
     where nothing is looked for; ``valid`` is where something is.
@@ -302,7 +302,7 @@ def _low(relative: np.ndarray, valid: np.ndarray, clear_height: float) -> tuple[
 
 
 def take_apart(depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and by lines of sight."""
+    """Take the wanted pixels apart at steps and by lines of sight: labels from 1, unordered."""
     labels = _components(depth, wanted, camera)
     return convex_parts.correct(labels, depth, camera, max(sigma, LEAST_SIGMA))
 

@@ -266,12 +266,12 @@ class SupportSurface:
 
 
 def flat_surface(plane: Plane) -> SupportSurface:
-    """A plane that is not known to be bent."""
+    """Make the surface of a plane that is not known to be bent."""
     return SupportSurface(plane, np.zeros(6), 0.0, plane.sigma)
 
 
 def fit_surface(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
-    """The surface that a plane was seen as.
+    """Fit the surface that a plane was seen as.
 
     Parameters
     ----------

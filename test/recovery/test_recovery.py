@@ -271,21 +271,16 @@ def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
     assert np.mean(truth[found.labels == 1] == 2) > 0.95
 
 
-def test_half_precision_is_read_as_single_precision(symmetry):
-    """Not even with a warning: the farthest reading is no number of half precision."""
+@pytest.mark.parametrize("form", ["half precision", "masked"])
+def test_the_same_readings_in_another_form_give_the_same_body(symmetry, form):
+    """Of half precision not even with a warning: the farthest reading is no number of it."""
     depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
-    depth = depth.astype(np.float16)
-    half, single = (symmetry.recover(image, CAMERA, labels) for image in (depth, depth.astype(np.float32)))
-    np.testing.assert_array_equal(half.bodies[0].superquadric.to_flat(), single.bodies[0].superquadric.to_flat())
-
-
-def test_masked_readings_are_none(symmetry):
-    depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
-    wrong = np.zeros(depth.shape, bool)
-    wrong[::3] = True
-    spoilt = np.where(wrong, 0.5 * depth, depth)
-    masked, missing = np.ma.masked_array(spoilt, wrong), np.where(wrong, np.nan, depth)
-    found, known = (symmetry.recover(image, CAMERA, labels).bodies[0].superquadric for image in (masked, missing))
+    half, wrong = depth.astype(np.float16), np.indices(depth.shape)[0] % 3 == 0
+    images = {
+        "half precision": (half, half.astype(np.float32)),
+        "masked": (np.ma.masked_array(np.where(wrong, 0.5 * depth, depth), wrong), np.where(wrong, np.nan, depth)),
+    }[form]
+    found, known = (symmetry.recover(image, CAMERA, labels).bodies[0].superquadric for image in images)
     np.testing.assert_array_equal(found.to_flat(), known.to_flat())
 
 
