@@ -105,7 +105,7 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
     reach = _reach(obj)
     axes, best = across(plane[:3]), 0.0
     points = obj.points
-    feet = _seen_from_above(points[points @ plane[:3] + plane[3] < low + _FEET], axes)
+    feet = (points[points @ plane[:3] + plane[3] < low + _FEET] @ axes).astype(np.float32)
     for other in near:
         points = other.points
         heights = points @ plane[:3] + plane[3]
@@ -113,17 +113,11 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
         if not len(ordered):
             continue
         height = float(np.median(ordered[densest(ordered, reach)]))
-        top = _seen_from_above(points[np.abs(heights - height) < reach], axes)
-        hull = cv2.convexHull(top)
+        hull = cv2.convexHull((points[np.abs(heights - height) < reach] @ axes).astype(np.float32))
         inside = np.median([cv2.pointPolygonTest(hull, foot, True) for foot in feet.tolist()])
         if inside > 0:
             best = max(best, height)
     return plane - np.array([0, 0, 0, best]) if best > 0 else None
-
-
-def _seen_from_above(points: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Points (n, 3) along two level axes (3, 2), float32 (n, 2)."""
-    return (points @ axes).astype(np.float32)
 
 
 def _meet(one: tuple[slice, slice], other: tuple[slice, slice]) -> bool:
