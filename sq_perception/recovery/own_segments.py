@@ -40,9 +40,8 @@ from sq_perception.segmentation.objectness import probability
 from sq_perception.segmentation.options import LARGEST_THING, POINTS, largest_edge
 from sq_perception.segmentation.segments import judge
 
-_ONE = (0.5, -1.0)
-"""k and c: between logistic regressions over pairs of segments of heaps, and of tables and rooms with low cameras among
-them, by the things that are found."""
+_ONE = (0.5, -0.5)
+"""k and c: of a logistic regression over pairs of segments of simulated scenes."""
 _CLEAREST = 6.0
 """A logit tells no more than this, either way."""
 _SURE = 0.85
