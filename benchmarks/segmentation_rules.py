@@ -63,7 +63,7 @@ RULES: dict[str, dict[str, Any]] = {
     "plane: things are near above it (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
     "support: bent": {f"{_S}.support_plane._DISTORTION": 0.0},
     "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
-    "level tops (level_faces)": {f"{_S}.level_faces.found": lambda *_: []},
+    "level tops (level_faces)": {f"{_S}.level_faces.find_faces": lambda *_: {}},
     "walls of containers (container_walls)": {f"{_S}.container_walls.walls": lambda *_: set()},
     "bodies: grazing sides (_GAP)": {f"{_S}.segments._GAP": 0.0},
     "bodies: feet and rims (_GROWN)": {f"{_S}.segments._GROWN": 0},
@@ -76,10 +76,10 @@ RULES: dict[str, dict[str, Any]] = {
     "behind something nearer (_ALONG)": {f"{_S}.convex_parts._ALONG": 1.0},
     "bits (_BIT_AS_ONE)": {f"{_S}.convex_parts._BIT_AS_ONE": 0.3},
     "network: a probability that it is a thing (LEAST)": {f"{_S}.objectness.LEAST": 0.0},
-    "network: parts": {f"{_OWN}.SegmentNetwork._parted": lambda *_: []},
+    "network: parts": {f"{_OWN}.SegmentNetwork._part": lambda *_: []},
     "network: a part claims itself (_ITSELF)": {f"{_OWN}._ITSELF": 0.0},
     "network: joins": {f"{_OWN}._ONE": (0.5, -np.inf)},
-    "network: all of it": {f"{_OWN}.SegmentNetwork.improved": lambda self, found: found},
+    "network: all of it": {f"{_OWN}.SegmentNetwork.improve": lambda self, found: found},
 }
 """What is put in the place of each rule; a rule that is gone from the package is gone from here."""
 
@@ -109,13 +109,13 @@ masks = cache(inference.load_masks)
 
 def segmented(depth: np.ndarray, camera: Camera, rule: str, known: dict[bytes, np.ndarray]) -> np.ndarray:
     """Own masks (height, width), as a recoverer has them; the network's answers to the same segments are ``known``."""
-    found = segments.proposed(depth, camera)
+    found = segments.propose(depth, camera)
     plane = b"" if found.plane is None else found.plane.tobytes()
     key = (rule if rule.startswith("network") else "").encode() + plane + found.labels.tobytes()
     if key not in known:
         network = SegmentNetwork(masks(), depth, camera, found.plane, lambda function, items: function(items))
-        found = network.improved(found)
-        known[key] = segments.limited(found, depth, camera, SegmentationOptions(max_objects=MOST)).labels
+        found = network.improve(found)
+        known[key] = segments.limit(found, depth, camera, SegmentationOptions(max_objects=MOST)).labels
     return known[key]
 
 

@@ -75,8 +75,8 @@ def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitO
     return surface_fit.fit(near, mask, view, start=predicted, options=options)
 
 
-def widened(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
-    """The fit of an object, unsure by how much farther it would reach if others were parts of it.
+def widen(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
+    """Return the fit of an object, unsure by how much farther it would reach if others were parts of it.
 
     With the probability q that another is, and d by how much half sizes and centre of the box around both exceed those
     of the body, second moments about the body grow by q d d^T: (1 - q) S + q (S + d d^T).

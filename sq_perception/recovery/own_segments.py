@@ -38,7 +38,7 @@ from sq_perception.learning.forward import CompactMasks
 from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.objectness import probability
 from sq_perception.segmentation.options import LARGEST_THING, POINTS, largest_edge
-from sq_perception.segmentation.segments import judged
+from sq_perception.segmentation.segments import judge
 
 _ONE = (0.5, -0.5)
 """k and c: of a logistic regression over pairs of segments of simulated scenes."""
@@ -48,8 +48,6 @@ _SURE = 0.85
 """A segment is parted only if a piece of it claims less."""
 _APART, _ITSELF = 0.3, 0.5
 """Pieces that claim less of each other are of two objects; one that claims less of itself shows none."""
-_LEAST_TO_PART, _LEAST_CELLS = 60, 4
-"""Cells in a view, of a segment that may be parted, and of another segment for a mean over them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,13 +87,13 @@ class SegmentNetwork:
     mapped: _Mapped
     max_size: float = LARGEST_THING
 
-    def improved(self, found: FrameEvidence) -> FrameEvidence:
-        """Segments parted, joined, with their outliers, without those of nothing; labels from 1, the largest first."""
+    def improve(self, found: FrameEvidence) -> FrameEvidence:
+        """Part and join segments, find their outliers, and drop those of nothing; labels from 1, the largest first."""
         if not found.ids:
             return found
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
-        parts = [] if self.plane is None else self._parted(labels, seen)
+        parts = [] if self.plane is None else self._part(labels, seen)
         if parts:
             seen |= self._seen(labels, parts)
         while len(seen) > 1 and (joined := self._join(labels, seen)):
@@ -109,9 +107,9 @@ class SegmentNetwork:
                 membership[answer.window][inside] = probability(logits)
         affinity = probability(np.maximum(_odds_of_one(labels, seen), -_CLEAREST))
         affinity = np.triu(affinity, 1) + np.triu(affinity, 1).T
-        return judged(replace(found, labels=labels, ids=tuple(seen), membership=membership, affinity=affinity), medians)
+        return judge(replace(found, labels=labels, ids=tuple(seen), membership=membership, affinity=affinity), medians)
 
-    def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
+    def _part(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
         """Part segments that are several objects, in ``labels``; returns the labels of all the parts."""
         doubts = {label: doubt for label, answer in seen.items() if (doubt := _doubt(answer)) is not None}
         objects = self.mapped(lambda some: [self._objects(seen[k].view, *doubts[k]) for k in some], list(doubts))
@@ -187,7 +185,7 @@ def _doubt(answer: _Seen) -> tuple[np.ndarray, np.ndarray] | None:
     """The pieces (p, p) of a segment's view, and the mean of p over each, if one may be of something else than most."""
     cells = (answer.view.image[..., segment_view.SEGMENT] > 0) & (answer.view.image[..., segment_view.MEASURED] > 0)
     rows, columns = np.nonzero(cells)
-    if len(rows) < _LEAST_TO_PART:
+    if not len(rows):
         return None
     pieces = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
     sure = _means(answer.logits, pieces)
@@ -229,11 +227,11 @@ def _odds_of_one(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
 
 
 def _claims(labels: np.ndarray, answer: _Seen) -> np.ndarray:
-    """The mean of the logit of p over each label in a view; -inf over 0, and over those of next to no cells."""
+    """The mean of the logit of p over each label in a view; -inf over 0, and over those out of the view."""
     height, width = labels.shape
     grid = np.ix_(np.clip(answer.view.rows, 0, height - 1), np.clip(answer.view.columns, 0, width - 1))
     there = np.where(answer.view.image[..., segment_view.IMAGE] > 0, labels[grid], 0).ravel()
     counts = np.bincount(there, minlength=int(labels.max()) + 1)
     sums = np.bincount(there, np.clip(answer.logits, -_CLEAREST, _CLEAREST).ravel(), len(counts))
     counts[0] = 0
-    return np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), -np.inf)
+    return np.where(counts > 0, sums / np.maximum(counts, 1), -np.inf)

@@ -36,7 +36,7 @@ from sq_perception.geometry.threads import one_kernel_thread
 from sq_perception.imaging import raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject, surroundings
-from sq_perception.segmentation.convex_parts import clustered
+from sq_perception.segmentation.convex_parts import cluster
 from sq_perception.segmentation.line_of_sight import SampledImage
 
 MOST_PARTS = 4
@@ -174,13 +174,13 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
     labels = (obj.mask_crop & (depth > 0)).astype(np.int32)
     extent = regions.extents(labels)[1]
     image = SampledImage(depth, labels, obj.camera_crop, 0.0, through)
-    some = image.sampled(1, extent, _SAMPLES)
+    some = image.sample(1, extent, _SAMPLES)
     if some is None:
         return
     crossed, far = image.within(some)
     seen = set()
     for limit in _LIMITS:
-        group = clustered(crossed, far, limit, max(4, _LEAST_SHARE * len(far)))
+        group = cluster(crossed, far, limit, max(4, _LEAST_SHARE * len(far)))
         if 0 < group.max() < MOST_PARTS and group.tobytes() not in seen:
             seen.add(group.tobytes())
             divided = np.zeros_like(labels)

@@ -211,7 +211,7 @@ class Recoverer:
             with timed(milliseconds, "score"):
                 scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], readings.options), range(len(fresh)))
         evidence = found.segmentation
-        likely, fragments, fewest = evidence.likely(), [], segments.least_pixels(evidence.labels.size)
+        likely, fragments, fewest = evidence.objectness_by_label(), [], segments.least_pixels(evidence.labels.size)
         for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True):
             thing = likely[obj.label]
             if evidence.membership is not None and fit.status != Status.FAILED:
@@ -242,8 +242,8 @@ class Recoverer:
             plane = supports.support(obj, found.objects, depth, camera, evidence, readings.options)
             obj = replace(obj, plane=plane)
             if readings.labels is not None:
-                obj = seen_object.completed(obj, depth, camera, evidence.labels)
-            return seen_object.viewed(obj, depth, camera, config)
+                obj = seen_object.complete(obj, depth, camera, evidence.labels)
+            return seen_object.add_views(obj, depth, camera, config)
 
         prepared = self._mapped(prepare, objects)
         return prepared if network is None else self._predict(prepared, network, readings.options)
@@ -261,7 +261,7 @@ class Recoverer:
         for k, obj in enumerate(objects):
             same = found.segmentation.affinities(obj.label)
             others = [(q, other) for other in found.objects if (q := same.get(other.label, 0.0)) > _DOUBT]
-            fits[k] = methods.widened(fits[k], others)
+            fits[k] = methods.widen(fits[k], others)
         return objects, fits, self._find_parts(objects, fits, depth, readings, deadline)
 
     @contextmanager
@@ -278,11 +278,11 @@ class Recoverer:
         depth, camera, options = readings.depth, readings.camera, readings.options
         if readings.labels is not None:
             return segments.from_labels(readings.labels, depth, camera, options)
-        proposed = segments.proposed(depth, camera, options.depth_range)
+        proposed = segments.propose(depth, camera, options.depth_range)
         if options.repair and isinstance(self._network_for(readings), inference.ThingPredictor):
             network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared, options.max_size)
-            return segments.limited(network.improved(proposed), depth, camera, options)
-        return segments.limited(segments.judged(proposed), depth, camera, options)
+            return segments.limit(network.improve(proposed), depth, camera, options)
+        return segments.limit(segments.judge(proposed), depth, camera, options)
 
     def _network_for(self, readings: Readings) -> Network | None:
         if readings.options.method not in NEEDS_NETWORK:
@@ -321,7 +321,7 @@ class Recoverer:
         divided = self._mapped(parts.Search.next_pieces, searches)
         while any(divided) and time.perf_counter() < deadline:
             pieces = [piece for some in divided for piece in some]
-            pieces = self._mapped(lambda each: seen_object.viewed(each, depth, camera, config), pieces)
+            pieces = self._mapped(lambda each: seen_object.add_views(each, depth, camera, config), pieces)
             if network is not None:
                 pieces = self._predict(pieces, network, options, mirror=False)
             found = iter(self._mapped(lambda each: methods.fit_view(each, depth, camera, options, deadline), pieces))

@@ -86,7 +86,7 @@ class SeenObject:
     unread : (n,)
         Those that were not measured, as indices into the image: a mask from colour tells that the object is there.
     mask : bool (height, width)
-        What measured it: those pixels without outliers, or with what goes on from them (:func:`completed`);
+        What measured it: those pixels without outliers, or with what goes on from them (:func:`complete`);
         ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask, depth and camera.
     plane : (4,) or None
         What it stands on.
@@ -174,8 +174,8 @@ def objects(depth: np.ndarray, found: FrameEvidence, camera: Camera) -> list[See
     return seen
 
 
-def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.ndarray) -> SeenObject:
-    """The object with a mask that was given some pixels too small completed; any other object as it is.
+def complete(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.ndarray) -> SeenObject:
+    """Return the object with a mask that was given some pixels too small completed; any other object as it is.
 
     Such a mask goes on nearly all around without a depth step, while beside a right one there is the support, what is
     far behind, or another object.  Uncompleted, the missing pixels would pass for free space beside the object, and the
@@ -214,10 +214,10 @@ def surroundings(
     return around, near, labels[around], camera.cropped(left, top, near.shape[1], near.shape[0])
 
 
-def viewed(
+def add_views(
     obj: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
 ) -> SeenObject:
-    """The object with ``shown``, the view for a network of this configuration, and ``view``, that for its score."""
+    """Return the object with ``shown``, the view for a network of this configuration, and ``view``, for its score."""
     inner = core(obj, depth, camera)
     shown = None
     if config is not None:

@@ -31,8 +31,6 @@ _HIGHEST_STACK = 0.5
 """Higher above its plane, metres, an object does not even stand on others that stand on it."""
 _FEET = 0.01
 """Metres above the lowest pixels that are an object's feet."""
-_FEWEST = 15
-"""Points of a top, of some thousand of its object."""
 _NOT_ON_IT = 0.1
 """Metres above its plane from which on what is beside an object may hold it."""
 _HELD = 0.15
@@ -67,7 +65,7 @@ def support(
         return top
     if not behind and -reach <= low < _HOVERING:
         return found.plane
-    depth, valid = segments.measured(depth, camera, options.depth_range)
+    depth, valid = segments.select_readings(depth, camera, options.depth_range)
     other = support_plane.around(found.labels, (obj.label,), depth, valid, camera, found.plane)
     if other is not None:
         lowest, middle = obj.levels(other.equation)
@@ -107,27 +105,19 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
     reach = _reach(obj)
     axes, best = across(plane[:3]), 0.0
     points = obj.points
-    feet = _seen_from_above(points[points @ plane[:3] + plane[3] < low + _FEET], axes)
+    feet = (points[points @ plane[:3] + plane[3] < low + _FEET] @ axes).astype(np.float32)
     for other in near:
         points = other.points
         heights = points @ plane[:3] + plane[3]
         ordered = np.sort(heights[heights < low + 2 * reach])
-        if len(ordered) < _FEWEST:
+        if not len(ordered):
             continue
         height = float(np.median(ordered[densest(ordered, reach)]))
-        top = _seen_from_above(points[np.abs(heights - height) < reach], axes)
-        if len(top) < _FEWEST:
-            continue
-        hull = cv2.convexHull(top)
+        hull = cv2.convexHull((points[np.abs(heights - height) < reach] @ axes).astype(np.float32))
         inside = np.median([cv2.pointPolygonTest(hull, foot, True) for foot in feet.tolist()])
         if inside > 0:
             best = max(best, height)
     return plane - np.array([0, 0, 0, best]) if best > 0 else None
-
-
-def _seen_from_above(points: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Points (n, 3) along two level axes (3, 2), float32 (n, 2)."""
-    return (points @ axes).astype(np.float32)
 
 
 def _meet(one: tuple[slice, slice], other: tuple[slice, slice]) -> bool:

@@ -52,8 +52,8 @@ _ALONG = 0.15
 """Share of lines that go along both surfaces, of two segments that are one behind a nearer one."""
 
 
-def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
-    """Segments taken apart where they are several convex bodies, and joined where they are one.
+def correct(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
+    """Take segments apart where they are several convex bodies, and join them where they are one.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: floa
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
         crossed = _crossed_between(image, parts, names, origin, rims)
-        group = linked(crossed, _AS_ONE)
+        group = link(crossed, _AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
     return regions.renumber(image.labels, number_of)
@@ -92,7 +92,7 @@ def warm_up() -> None:
     v, u = np.indices((camera.height, camera.width))
     radius = np.hypot(np.abs(u - camera.cx) - 12, v - camera.cy) / 12
     depth = np.where(radius < 1, 0.7 - 0.07 * np.sqrt(np.maximum(1 - radius**2, 0)), 1.0)
-    corrected((radius < 1).astype(np.int32), depth, camera, 1e-3)
+    correct((radius < 1).astype(np.int32), depth, camera, 1e-3)
 
 
 def _rims(image: SampledImage) -> np.ndarray:
@@ -111,7 +111,7 @@ def _part(image: SampledImage) -> tuple[list[Samples], np.ndarray]:
     """
     extents = regions.extents(image.labels)
     origin = list(range(len(extents)))
-    parts, new = {k: image.sampled(k, extents[k], _FEW) for k in np.flatnonzero(extents[:, 0]).tolist()}, []
+    parts, new = {k: image.sample(k, extents[k], _FEW) for k in np.flatnonzero(extents[:, 0]).tolist()}, []
     for label, part in parts.items():
         pieces = [] if part is None else _pieces(image, part, extents[label])
         new += [label] if pieces else []
@@ -121,7 +121,7 @@ def _part(image: SampledImage) -> tuple[list[Samples], np.ndarray]:
             origin.append(label)
     if new:
         extents = regions.extents(image.labels)
-        parts |= {k: image.sampled(k, extents[k], _FEW) for k in new}
+        parts |= {k: image.sample(k, extents[k], _FEW) for k in new}
     return [part for part in parts.values() if part is not None], np.array(origin)
 
 
@@ -135,10 +135,10 @@ def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tupl
         return []
     if image.within(part)[0].mean() < _SUSPICIOUS:
         return []
-    whole = image.sampled(part.label, extent, _MANY)
+    whole = image.sample(part.label, extent, _MANY)
     assert whole is not None  # no fewer than a few
     crossed, far = image.within(whole)
-    group = clustered(crossed, far, _APART, max(LEAST_SAMPLES, least / whole.spacing**2))
+    group = cluster(crossed, far, _APART, max(LEAST_SAMPLES, least / whole.spacing**2))
     if group.any():
         group = _with_whole_vessels(group, image.is_inside(whole, group), far)
     return image.pieces(extent, whole, group, _MANY) if group.any() else []
@@ -184,18 +184,18 @@ def _crossed_between(
     return crossed
 
 
-def clustered(crossed: np.ndarray, far: np.ndarray, limit: float, least: float) -> np.ndarray:
-    """Groups (n,) of samples, from 0, by whether lines between them (n, n) are crossed, and by their distance; what
+def cluster(crossed: np.ndarray, far: np.ndarray, limit: float, least: float) -> np.ndarray:
+    """Group samples, numbers (n,) from 0, by whether lines between them (n, n) are crossed, and by their distance; what
     has less than ``least`` samples joins the group that it is nearest to."""
-    group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), limit)
+    group = link(crossed + _METRIC * far / max(far.max(), 1e-9), limit)
     keep = np.flatnonzero(np.bincount(group)[group] >= least)
     if not len(keep):
         return np.zeros_like(group)
     return np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
 
 
-def linked(distance: np.ndarray, limit: float) -> np.ndarray:
-    """Groups (n,) from 0 by average linkage: the two nearest are joined until none of (n, n) are nearer than a limit.
+def link(distance: np.ndarray, limit: float) -> np.ndarray:
+    """Group by average linkage, numbers (n,) from 0: join the two nearest until none of (n, n) are nearer than a limit.
 
     inf is no distance: that of the other one holds.
     """

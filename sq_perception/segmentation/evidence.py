@@ -15,11 +15,11 @@ import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_plane import SupportSurface
+from sq_perception.segmentation.support_plane import LEAST_SIGMA, SupportSurface
 
-LEAST_SIGMA, UNKNOWN_SIGMA = 5e-4, 1.5e-3
-"""Noise of the depth at one metre, metres: what is assumed at least, as rendered images have none, and where no support
-shows it, that of structured light (Khoshelham and Oude Elberink, Sensors 2012)."""
+UNKNOWN_SIGMA = 1.5e-3
+"""Noise of the depth at one metre, metres, where no support shows it: that of structured light (Khoshelham and Oude
+Elberink, Sensors 2012)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class FrameEvidence:
             return np.zeros(self.labels.shape, bool)
         return (self.labels > 0) & (self.membership < 0.5)
 
-    def likely(self) -> dict[int, float]:
+    def objectness_by_label(self) -> dict[int, float]:
         """The probability that each object is a thing, by its label."""
         return dict(zip(self.ids, self.objectness or (1.0,) * len(self.ids), strict=True))
 
@@ -86,8 +86,8 @@ class FrameEvidence:
             return {}
         return dict(zip(self.ids, self.affinity[self.ids.index(label)].tolist(), strict=True))
 
-    def kept(self, likely: dict[int, float]) -> FrameEvidence:
-        """The objects of some labels, with the probability that each is a thing; renumbered from 1, largest first."""
+    def keep(self, likely: dict[int, float]) -> FrameEvidence:
+        """Keep the objects of some labels, with their probabilities to be things; renumbered from 1, largest first."""
         if tuple(likely) == self.ids == tuple(range(1, len(self.ids) + 1)):
             return replace(self, objectness=tuple(likely.values()))
         counts = regions.extents(self.labels)[:, 0]

@@ -15,7 +15,6 @@ Metres, optical frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,35 +22,12 @@ from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.options import POINTS, TURNS, across
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat, noise_growth
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat_surface, noise_growth
 
 _LOWEST = 5.0
 """Tolerances above the support at which a face lies at least: lower ones are books and bumps."""
 _LAYER = 0.7
 """Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
-_FEWEST = 30
-"""Points of a face, of some hundred of its segment."""
-
-
-@dataclass(frozen=True, eq=False)
-class LevelFace:
-    """A level face of a segment, as a support, and points (n, 3) of the whole segment, evenly taken."""
-
-    label: int
-    surface: SupportSurface
-    points: np.ndarray
-
-    def under(self, labels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Pixels, bool (height, width), of the segment itself and of all segments whose middle is right above it."""
-        axes = TURNS @ across(self.surface.plane.equation[:3]).T
-        reach = axes @ self.points.T
-        low, high = reach.min(axis=1), reach.max(axis=1)
-        is_over = np.zeros(int(labels.max(initial=0)) + 1, bool)
-        for label, points in samples(labels, depth, camera, 1).items():
-            middle = np.median(axes @ points.T, axis=1)
-            is_over[label] = ((middle > low) & (middle < high)).all()
-        is_over[self.label] = True
-        return is_over[labels]
 
 
 def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -> dict[int, np.ndarray]:
@@ -62,21 +38,35 @@ def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -
     return {k: regions.some_points(*regions.pixels(labels, k, extents[k]), depth, camera, POINTS) for k in order}
 
 
-def found(
+def find_faces(
     segments: Mapping[int, np.ndarray], labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface,
     least: int,
-) -> list[LevelFace]:
-    """The level faces of segments that have one, and at least ``least`` pixels above it; in the order of ``segments``,
-    which are samples of what stands on the ``support``, as :func:`samples` gives them."""
-    seen = {label: face for label, points in segments.items() if (face := _face(points, support)) is not None}
-    extents = regions.extents(labels) if seen else np.empty(0)
-    faces = []
-    for label, face in seen.items():
-        everything = camera.unproject(*(pixels := regions.pixels(labels, label, extents[label]))[::-1], depth[pixels])
-        off = face.plane.height(everything) / noise_growth(everything[:, 2])
-        if np.count_nonzero(off > face.clear_height) >= least:
-            faces.append(LevelFace(label, face, segments[label]))
+) -> dict[int, SupportSurface]:
+    """Find the level faces, as supports, of the segments that have one, and at least ``least`` pixels above it; in the
+    order of ``segments``, samples of what stands on the ``support``."""
+    extents, faces = regions.extents(labels), {}
+    for label, points in segments.items():
+        if (face := _face(points, support)) is not None:
+            pixels = regions.pixels(labels, label, extents[label])
+            everything = camera.unproject(*pixels[::-1], depth[pixels])
+            off = face.plane.height(everything) / noise_growth(everything[:, 2])
+            if np.count_nonzero(off > face.clear_height) >= least:
+                faces[label] = face
     return faces
+
+
+def find_above(
+    label: int, face: SupportSurface, labels: np.ndarray, depth: np.ndarray, camera: Camera
+) -> np.ndarray:
+    """Find the pixels (height, width) of a segment with a level face and of all whose middle is right above it."""
+    axes = TURNS @ across(face.plane.equation[:3]).T
+    some = samples(labels, depth, camera, 1)
+    low, high = (axes @ some[label].T).min(axis=1), (axes @ some[label].T).max(axis=1)
+    is_over = np.zeros(int(labels.max()) + 1, bool)
+    for other, points in some.items():
+        middle = np.median(axes @ points.T, axis=1)
+        is_over[other] = other == label or ((middle > low) & (middle < high)).all()
+    return is_over[labels]
 
 
 def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
@@ -86,14 +76,14 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     reach = TOLERANCE * quantile(growth, 0.5)
     ordered = np.sort(height[height >= _LOWEST * reach])
     level = ordered[densest(ordered, reach)]
-    if len(level) < _FEWEST:
+    if not len(level):
         return None
     at = float(np.median(level))
     off = (height - at) / growth
     on = np.abs(off) < TOLERANCE
     count = np.count_nonzero(on)
     within, above = (int(np.count_nonzero(some)) for some in (np.abs(off) < 2 * TOLERANCE, off > TOLERANCE))
-    if count < max(_FEWEST, _LAYER * within, above):
+    if count < max(_LAYER * within, above):
         return None
     sigma = max(support.sigma, deviation(np.abs(off[on])))
-    return flat(Plane(support.plane.equation - np.array([0, 0, 0, at]), count / len(points), sigma))
+    return flat_surface(Plane(support.plane.equation - np.array([0, 0, 0, at]), count / len(points), sigma))

@@ -91,8 +91,8 @@ class SampledImage:
     def focal(self) -> float:
         return math.sqrt(self.camera.fx * self.camera.fy)
 
-    def sampled(self, label: int, extent: np.ndarray, count: int) -> Samples | None:
-        """Some ``count`` samples of a segment; None where they are too few to say anything."""
+    def sample(self, label: int, extent: np.ndarray, count: int) -> Samples | None:
+        """Take some ``count`` samples of a segment; None where they are too few to say anything."""
         size, top, bottom, left, right = extent.tolist()
         step = stride(size, count)
         top, left = (first + (step // 2 - first) % step for first in (top, left))
@@ -118,9 +118,10 @@ class SampledImage:
         ``count``."""
         rows, columns = regions.pixels(self.labels, samples.label, extent)
         block = max(1, stride(len(rows), count) // 4)
-        by_group = samples.pixels, samples.z, group, int(group.max()) + 1
-        seen = self.depth, self.focal, samples.spacing, block, self.noise, self.least
-        chosen = _assigned(rows, columns, *by_group, *seen)
+        chosen = _assign(
+            rows, columns, samples.pixels, samples.z, group, int(group.max()) + 1, self.depth, self.focal,
+            samples.spacing, block, self.noise, self.least,
+        )
         pieces = [(rows[chosen == k], columns[chosen == k]) for k in range(int(group.max()) + 1)]
         return [piece for piece in pieces if len(piece[0])]
 
@@ -269,7 +270,7 @@ def _gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.
 
 
 @kernel
-def _assigned(
+def _assign(
     rows: np.ndarray, columns: np.ndarray, samples: np.ndarray, z: np.ndarray, part: np.ndarray, parts: int,
     depth: np.ndarray, focal: float, spacing: float, block: int, noise: float, least: float,
 ) -> np.ndarray:

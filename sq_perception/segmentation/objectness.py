@@ -32,6 +32,8 @@ from typing import Any
 import cv2
 import numpy as np
 
+from sq_perception.segmentation.support_plane import LEAST_SIGMA
+
 _WEIGHTS = (1.08, 9.8, -22.6)
 """a, b, c, by 8 504 segments of 900 scenes of benchmarks/common/segmentation_scenes (seeds from 300 000)."""
 _MOST_SURE = 8.0
@@ -49,8 +51,6 @@ _BLOCKS = (4, 32)
 """Pixels a side of the smallest and the largest block of the support."""
 _SUPPORT = 0.03
 """Up to this height, metres, a pixel of no segment tells of the support."""
-_LEAST_DEVIATION = 3e-4
-"""Metres: a rendered image has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class HeightEvidence:
             side = int(np.clip(2.0 ** round(math.log2(max(0.5 * math.sqrt(counts[label]), 1))), *_BLOCKS))
             if side not in deviations:
                 of_means = _deviation_of_means(self.relative, is_support, side)
-                deviations[side] = max(min(of_means, self.sigma), _LEAST_DEVIATION)
+                deviations[side] = max(min(of_means, self.sigma), LEAST_SIGMA)
             z[k] = means[label] / deviations[side]
         return z
 

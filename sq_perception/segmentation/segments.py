@@ -34,10 +34,10 @@ from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import container_walls, convex_parts, level_faces, objectness, support_plane
-from sq_perception.segmentation.evidence import LEAST_SIGMA, UNKNOWN_SIGMA, FrameEvidence
+from sq_perception.segmentation.evidence import UNKNOWN_SIGMA, FrameEvidence
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, LARGEST_THING, POINTS, SegmentationOptions, largest_edge
-from sq_perception.segmentation.support_plane import CLEARLY, TOLERANCE, SupportSurface
+from sq_perception.segmentation.support_plane import CLEARLY, LEAST_SIGMA, TOLERANCE, SupportSurface
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m."""
@@ -78,52 +78,52 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         If the image does not fit the camera.
     """
     options = options or SegmentationOptions()
-    return limited(judged(proposed(depth, camera, options.depth_range)), depth, camera, options)
+    return limit(judge(propose(depth, camera, options.depth_range)), depth, camera, options)
 
 
-def proposed(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> FrameEvidence:
-    """Segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
-    depth, valid = measured(depth, camera, depth_range)
+def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] = EVERYTHING) -> FrameEvidence:
+    """Find segments that may be objects; neither judged nor limited.  Arguments and errors as for :func:`segment`."""
+    depth, valid = select_readings(depth, camera, depth_range)
     least = least_pixels(depth.size)
     if not camera.is_pinhole:
-        return _ordered(FrameEvidence(depth_steps.components(valid)), least)
+        return _order(FrameEvidence(depth_steps.components(valid)), least)
     if np.count_nonzero(valid) < least:
         return FrameEvidence(np.zeros(depth.shape, np.int32))
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
-    is_silhouette, seen = _is_silhouette(valid), np.nonzero(valid)
-    if is_silhouette and largest_edge(regions.some_points(*seen, known, camera, POINTS)) <= LARGEST_THING:
+    is_silhouette, (rows, columns) = _is_silhouette(valid), np.nonzero(valid)
+    if is_silhouette and largest_edge(regions.some_points(rows, columns, known, camera, POINTS)) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
     plane = support_plane.support(depth, valid, camera)
     if plane is None:
         return _without_support(known, valid, camera, least)
-    support = support_plane.measured(plane, known, valid, camera)
+    support = support_plane.fit_surface(plane, known, valid, camera)
     relative = support.image_relative(known, camera)
-    labels = _raised(known, camera, relative, valid, support)
+    labels = _find_raised(known, camera, relative, valid, support)
     tops = level_faces.samples(labels, known, camera, least)
-    for face in level_faces.found(tops, labels, known, camera, support, least):
-        labels = _unloaded(labels, face, known, camera, least)
+    for label, face in level_faces.find_faces(tops, labels, known, camera, support, least).items():
+        labels = _unload(labels, label, face, known, camera, least)
     around = container_walls.walls(tops, plane.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
-    found = _ordered(FrameEvidence(labels, support=support), least)
+    found = _order(FrameEvidence(labels, support=support), least)
     if is_silhouette and not found.ids:
         return _without_support(known, valid, camera, least)
     return replace(found, heights=HeightEvidence(relative, found.labels, support.sigma))
 
 
-def judged(found: FrameEvidence, medians: Mapping[int, float] | None = None) -> FrameEvidence:
-    """Segments that are things by their heights, and by the median logits of a network that saw all of them; where
-    there is no support, all."""
+def judge(found: FrameEvidence, medians: Mapping[int, float] | None = None) -> FrameEvidence:
+    """Keep segments that are things by their heights, and by the median logits of a network that saw them; where there
+    is no support, all of them."""
     likely = dict.fromkeys(found.ids, 1.0)
     if found.heights is not None:
         rise = found.heights.rise(found.labels, found.ids).tolist()
         asked = dict.fromkeys(found.ids) if medians is None else medians
         likely = {k: objectness.prior(z, asked[k]) for k, z in zip(found.ids, rise, strict=True)}
-    return found.kept({label: each for label, each in likely.items() if each >= objectness.LEAST})
+    return found.keep({label: each for label, each in likely.items() if each >= objectness.LEAST})
 
 
-def limited(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> FrameEvidence:
-    """Segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
-    depth, valid = measured(depth, camera, options.depth_range)
+def limit(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> FrameEvidence:
+    """Keep segments that are no larger than ``max_size``, in the workspace, and no more than ``max_objects``."""
+    depth, valid = select_readings(depth, camera, options.depth_range)
     up = None if found.plane is None else found.plane[:3]
     larger, outside = set(), set()
     extents = regions.extents(found.labels)
@@ -137,10 +137,10 @@ def limited(found: FrameEvidence, depth: np.ndarray, camera: Camera, options: Se
             outside.add(label)
     left = [label for label in found.ids if label not in larger | outside]
     ids = left[: options.max_objects]
-    likely = found.likely()
+    likely = found.objectness_by_label()
     is_cut = found.is_cut or len(left) > len(ids)
     found = replace(found, is_cut=is_cut, larger=len(larger), outside=len(outside), heights=None)
-    return found.kept({label: likely[label] for label in ids})
+    return found.keep({label: likely[label] for label in ids})
 
 
 def from_labels(
@@ -169,7 +169,7 @@ def from_labels(
     if labels.ndim != 2:
         raise ValueError(f"labels: expected shape (height, width), got {labels.shape}")
     camera.check_image(labels)
-    depth, valid = measured(depth, camera, options.depth_range)
+    depth, valid = select_readings(depth, camera, options.depth_range)
     labels = np.maximum(labels, 0).astype(np.int32)
     inside = np.flatnonzero(valid & (labels > 0))  # of a table with few things, few pixels: these are sorted
     values, counts = np.unique(labels.flat[inside], return_counts=True)
@@ -183,7 +183,7 @@ def from_labels(
     is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
     around = support_plane.around(labels, ids, depth, valid, camera) if ids and camera.is_pinhole else None
-    return FrameEvidence(labels, ids, None if around is None else support_plane.flat(around), is_cut=is_cut)
+    return FrameEvidence(labels, ids, None if around is None else support_plane.flat_surface(around), is_cut=is_cut)
 
 
 def least_pixels(size: int) -> int:
@@ -201,8 +201,8 @@ def warm_up() -> None:
     segment(np.where(np.abs(radius - 1.2) < 0.1, np.float32(np.nan), depth), camera)
 
 
-def measured(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """The depth, float32, and where it is a measurement within limits."""
+def select_readings(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the depth, float32, and where it is a measurement within limits."""
     depth = camera.readings(depth).astype(np.float32, copy=False)
     near, far = limits
     valid = np.isfinite(depth) if np.isinf(far) else depth <= far
@@ -223,37 +223,37 @@ def _is_silhouette(valid: np.ndarray) -> bool:
 
 def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least: int) -> FrameEvidence:
     """The segments of an image that shows no support plane, but those that fill it, as a wall does."""
-    labels = taken_apart(known, valid, camera, UNKNOWN_SIGMA)
-    found = _ordered(FrameEvidence(labels), least)
+    labels = take_apart(known, valid, camera, UNKNOWN_SIGMA)
+    found = _order(FrameEvidence(labels), least)
     if _is_silhouette(valid):
         return found
-    return found.kept({k: 1.0 for k in found.ids if not regions.fills(regions.box(found.labels == k), valid)})
+    return found.keep({k: 1.0 for k in found.ids if not regions.fills(regions.box(found.labels == k), valid)})
 
 
-def _unloaded(
-    labels: np.ndarray, face: level_faces.LevelFace, known: np.ndarray, camera: Camera, least: int
+def _unload(
+    labels: np.ndarray, label: int, face: SupportSurface, known: np.ndarray, camera: Camera, least: int
 ) -> np.ndarray:
-    """Labels in which what stands on a level face of a segment has its own, found with the face as support."""
-    relative = face.surface.image_relative(known, camera)
-    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    parts = _ordered(FrameEvidence(_raised(known, camera, relative * valid, valid, face.surface)), least)
-    heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.surface.sigma)
-    parts = judged(replace(parts, heights=heights))
+    """Give what stands on the level face of a segment labels of its own, found with the face as support."""
+    relative = face.image_relative(known, camera)
+    valid = level_faces.find_above(label, face, labels, known, camera) & (relative > -TOLERANCE)
+    parts = _order(FrameEvidence(_find_raised(known, camera, relative * valid, valid, face)), least)
+    heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.sigma)
+    parts = judge(replace(parts, heights=heights))
     return np.where(parts.labels > 0, parts.labels + labels.max(), labels)
 
 
-def _ordered(found: FrameEvidence, least: int) -> FrameEvidence:
-    """The largest segments of at least so many pixels."""
+def _order(found: FrameEvidence, least: int) -> FrameEvidence:
+    """Keep the largest segments of at least so many pixels."""
     counts = regions.extents(found.labels)[:, 0]
     order = np.argsort(-counts, kind="stable")
     order = order[counts[order] >= least]
-    return replace(found, is_cut=len(order) > _MOST).kept(dict.fromkeys(order[:_MOST].tolist(), 1.0))
+    return replace(found, is_cut=len(order) > _MOST).keep(dict.fromkeys(order[:_MOST].tolist(), 1.0))
 
 
-def _raised(
+def _find_raised(
     known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
 ) -> np.ndarray:
-    """Bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
+    """Find bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
 
     ``known`` and ``relative`` (height, width) are depth, and height above the support as at one metre of depth, both 0
     where nothing is looked for; ``valid`` is where something is.
@@ -274,7 +274,7 @@ def _raised(
     # Contiguous, as kernels are compiled for arrays of a kind.
     known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
     camera = camera.cropped(left, top, known.shape[1], known.shape[0])
-    inside = taken_apart(known, clear, camera, support.sigma)
+    inside = take_apart(known, clear, camera, support.sigma)
     foot = raised[window] & (inside == 0)
     labels[window] = depth_steps.grow(inside, foot, known, _GROWN, depth_steps.STEP)
     return labels
@@ -301,10 +301,10 @@ def _low(relative: np.ndarray, valid: np.ndarray, clear_height: float) -> tuple[
     return near, near & (wide > height)
 
 
-def taken_apart(depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and by lines of sight."""
+def take_apart(depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
+    """Take the wanted pixels apart at steps and by lines of sight: labels from 1, unordered."""
     labels = _components(depth, wanted, camera)
-    return convex_parts.corrected(labels, depth, camera, max(sigma, LEAST_SIGMA))
+    return convex_parts.correct(labels, depth, camera, max(sigma, LEAST_SIGMA))
 
 
 def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.ndarray:

@@ -36,8 +36,8 @@ TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
 _LEAST_SHARE = 0.05
 """Share of the valid pixels that a plane has at least."""
-_POINTS = 8000
-"""Points of an image that planes are fitted to."""
+_PLANE_POINTS, _POINTS = 1500, 8000
+"""On so many points planes are counted, and the best one is fitted."""
 _HYPOTHESES, _FEW_POINTS = 1000, 300
 """So many draws are counted on a few points."""
 _TYPICAL_HEIGHT, _FAR = 0.1, 0.1
@@ -46,6 +46,8 @@ far from all planes, it says nothing."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
+LEAST_SIGMA = 5e-4
+"""Noise of the depth at one metre, metres, that is assumed at least: rendered images have none."""
 CLEARLY = 4.0
 """Standard deviations of the noise from which on a height is none of it."""
 _DISTORTION = 0.02
@@ -110,10 +112,10 @@ def support(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> Plane | Non
     depth, valid : (height, width)
         Metres, and where they are a measurement.
     """
-    points = some_points(depth, valid, camera)
-    candidates = planes(points)
+    candidates = planes(some_points(depth, valid, camera))
     if not candidates:
         return None
+    points = some_points(depth, valid, camera, _PLANE_POINTS)
     heights = np.stack([plane.height(points) for plane in candidates])
     rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
     near = np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0).sum(axis=1) / max(rest.shape[1], 1)
@@ -164,19 +166,20 @@ def around(
     return best
 
 
-def some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.ndarray:
-    """Points (k, 3) of the wanted pixels; some thousand, evenly taken, where there are more."""
+def some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera, count: int = _POINTS) -> np.ndarray:
+    """Points (k, 3) of the wanted pixels; about ``count``, evenly taken, where there are more."""
     pixels = np.flatnonzero(wanted)
-    rows, columns = np.divmod(pixels[:: max(1, pixels.size // _POINTS)], camera.width)
+    rows, columns = np.divmod(pixels[:: max(1, pixels.size // count)], camera.width)
     return camera.unproject(columns, rows, depth[rows, columns])
 
 
 def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
     """The plane (4,) with most points within the tolerance * z^2, and which points these are."""
-    candidates = _through_three(points, rng)
+    few = points[:: max(1, len(points) // _PLANE_POINTS)]
+    candidates = _through_three(few, rng)
     if not len(candidates):
         return None, np.zeros(len(points), bool)
-    few = points[:: max(1, len(points) // _FEW_POINTS)]
+    few = few[:: max(1, len(few) // _FEW_POINTS)]
     weighted = np.stack([*few.T, np.ones(len(few))]) / (TOLERANCE * noise_growth(few[:, 2]))
     plane = candidates[_votes(candidates, weighted.astype(np.float32)).argmax()].astype(float)
     growth = noise_growth(points[:, 2])
@@ -263,13 +266,13 @@ class SupportSurface:
         return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
 
 
-def flat(plane: Plane) -> SupportSurface:
-    """A plane that is not known to be bent."""
+def flat_surface(plane: Plane) -> SupportSurface:
+    """Make the surface of a plane that is not known to be bent."""
     return SupportSurface(plane, np.zeros(6), 0.0, plane.sigma)
 
 
-def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
-    """The surface that a plane was seen as.
+def fit_surface(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
+    """Fit the surface that a plane was seen as.
 
     Parameters
     ----------
@@ -280,18 +283,20 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    points = some_points(depth, valid, camera)
+    k = max(1, min(depth.shape) // 60)  # samples along the shorter side
+    rows, columns = np.nonzero(valid[::k, ::k])
+    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
     z = points[:, 2]
     x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
     height = plane.height(points) / growth
     on = np.abs(height) < TOLERANCE
     if not on.any():
-        return flat(plane)
+        return flat_surface(plane)
     limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
     for _ in range(6):
         if np.count_nonzero(on) < 10 * len(terms):
-            return flat(plane)
+            return flat_surface(plane)
         bend = np.linalg.lstsq((terms * on) @ terms.T, terms @ (on * height), rcond=None)[0]
         off, last = np.abs(height - np.clip(bend @ terms, -limit, limit)), on
         on = off < TOLERANCE

@@ -170,7 +170,7 @@ def _mask(
 ) -> np.ndarray:
     """Draw a mask as from a segmentation or a person, without readings of the table, as in views of images."""
     # Few masks are too small, as those that are all around are completed before a view is made
-    # (recovery.seen_object.completed), and what a stereo camera widens an edge by looks like them.
+    # (recovery.seen_object.complete), and what a stereo camera widens an edge by looks like them.
     error = int(rng.choice((-2, -1, 0, 0, 0, 0, 0, 1, 1, 2)))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:

@@ -75,6 +75,6 @@ masks = cache(inference.load_masks)
 
 def judged_by_network(depth, camera, **options):
     """The segments of an image as a recoverer has them: with the shipped network of masks."""
-    found = segments.proposed(depth, camera)
+    found = segments.propose(depth, camera)
     network = SegmentNetwork(masks(), depth, camera, found.plane, lambda function, labels: function(labels))
-    return segments.limited(network.improved(found), depth, camera, SegmentationOptions(**options))
+    return segments.limit(network.improve(found), depth, camera, SegmentationOptions(**options))

@@ -26,7 +26,7 @@ def two_boxes() -> tuple[list[seen_object.SeenObject], Fit]:
 def test_second_moments_are_those_of_a_body_that_may_reach_over_both(likely: float) -> None:
     """The stack is 4 cm higher: with probability q half of its height and its centre are 2 cm more along the axis."""
     (_, upper), fit = two_boxes()
-    found = methods.widened(fit, [(likely, upper)])
+    found = methods.widen(fit, [(likely, upper)])
     axis = int(np.abs(fit.superquadric.rotation_matrix.T @ TABLE.plane[:3]).argmax())
     added = np.diag(found.covariance - fit.covariance)
     assert added[axis] == pytest.approx(likely * 0.02**2, rel=0.1)
@@ -39,7 +39,7 @@ def test_second_moments_are_those_of_a_body_that_may_reach_over_both(likely: flo
 def test_what_lies_within_the_body_and_what_is_surely_another_add_nothing() -> None:
     (lower, upper), fit = two_boxes()
     for others in ([(1.0, lower)], [(0.0, upper)], []):
-        found = methods.widened(fit, others)
+        found = methods.widen(fit, others)
         np.testing.assert_allclose(found.covariance, fit.covariance, atol=1e-8)
         assert found.status == Status.CONVERGED
 
@@ -47,7 +47,7 @@ def test_what_lies_within_the_body_and_what_is_surely_another_add_nothing() -> N
 def test_pairs_keep_their_probability_when_others_go() -> None:
     labels = np.repeat(np.array([[1, 1, 1, 2, 2, 3]], np.int32), 4, axis=0)
     same = np.array([[0, 0.1, 0.2], [0.1, 0, 0.3], [0.2, 0.3, 0]])
-    found = FrameEvidence(labels, (1, 2, 3), affinity=same).kept({3: 0.9, 2: 0.8})
+    found = FrameEvidence(labels, (1, 2, 3), affinity=same).keep({3: 0.9, 2: 0.8})
     assert found.ids == (1, 2)
     assert found.affinity is not None
     assert found.affinity[0, 1] == found.affinity[1, 0] == 0.3

@@ -19,7 +19,7 @@ from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_plane import Plane, flat
+from sq_perception.segmentation.support_plane import Plane, flat_surface
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.scenes import plane_depth
@@ -40,7 +40,7 @@ def segmentation(labels: np.ndarray) -> FrameEvidence:
     counts = np.bincount(labels.ravel())
     ids = sorted(np.flatnonzero(counts)[1:].tolist(), key=lambda label: -counts[label])
     heights = np.where(labels > 0, 0.05, 1e-4).astype(np.float32)
-    support = flat(Plane(PLANE, 1.0, 1e-3))
+    support = flat_surface(Plane(PLANE, 1.0, 1e-3))
     return FrameEvidence(labels, tuple(ids), support, heights=HeightEvidence(heights, labels, 1e-3))
 
 
@@ -75,7 +75,7 @@ def test_the_rim_that_a_sensor_adds_is_an_outlier(shipped: Any) -> None:
     brush = np.ones((5, 5), np.uint8)
     wider = cv2.dilate((truth > 0).view(np.uint8), brush) > 0
     depth = np.where(wider & (truth == 0), cv2.erode(np.where(truth > 0, depth, np.inf), brush), depth)
-    found = of(shipped, depth.astype(np.float32)).improved(segmentation(wider.astype(np.int32)))
+    found = of(shipped, depth.astype(np.float32)).improve(segmentation(wider.astype(np.int32)))
     np.testing.assert_array_equal(found.labels, wider)
     assert not (found.outliers & ~wider).any()
     own = wider & ~found.outliers
@@ -93,7 +93,7 @@ def test_the_rim_that_a_stereo_camera_adds_is_an_outlier(shipped: Any) -> None:
         rng = np.random.default_rng(seed)
         measured = sensor_noise.preset("realsense_d435").measure(depth.astype(float), CAMERA, rng)
         can = wider & (np.abs(measured - np.median(depth[truth > 0])) < CAN[0][0])
-        found = of(shipped, measured).improved(segmentation(can.astype(np.int32)))
+        found = of(shipped, measured).improve(segmentation(can.astype(np.int32)))
         np.testing.assert_array_equal(found.labels, can)
         assert not (found.outliers & ~can).any()
         counts += [[np.sum(each & (truth > 0)), np.sum(each & (truth == 0))] for each in (can, can & ~found.outliers)]
@@ -107,7 +107,7 @@ def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> No
     depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
     middle = np.median(np.nonzero(truth == 1)[1])
     halves = np.where((truth == 1) & (np.arange(CAMERA.width) > middle), 3, truth).astype(np.int32)
-    found = of(shipped, depth).improved(segmentation(halves))
+    found = of(shipped, depth).improve(segmentation(halves))
     assert len(found.ids) == 2
     for can in (1, 2):
         assert len(np.unique(found.labels[truth == can])) == 1
@@ -115,7 +115,7 @@ def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> No
 
 def test_two_boxes_under_one_label_become_two(shipped: Any) -> None:
     depth, truth = seen([TABLE.body(-0.055, 0, (0.05, 0.04, 0.03)), TABLE.body(0.035, 0.01, (0.04, 0.03, 0.06))])
-    found = of(shipped, depth).improved(segmentation((truth > 0).astype(np.int32)))
+    found = of(shipped, depth).improve(segmentation((truth > 0).astype(np.int32)))
     assert found.ids == (1, 2)
     for box in (1, 2):
         mine = found.labels == np.bincount(found.labels[truth == box]).argmax()
@@ -138,7 +138,7 @@ def claims_of_halves(views: np.ndarray) -> np.ndarray:
 
 def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(GivenLogits(claims_of_halves), depth).improved(segmentation(truth))
+    found = of(GivenLogits(claims_of_halves), depth).improve(segmentation(truth))
     assert found.ids == (1, 2)
     np.testing.assert_array_equal(found.labels > 0, truth > 0)
     columns = [np.nonzero(found.labels == label)[1] for label in found.ids]
@@ -155,7 +155,7 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
 
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(right_alone)
-    found = of(network, depth).improved(replace(segmentation(truth), heights=None))
+    found = of(network, depth).improve(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
     assert network.asked > 1
 
@@ -163,7 +163,7 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
 def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
-    np.testing.assert_array_equal(of(network, depth).improved(segmentation(truth)).labels, truth)
+    np.testing.assert_array_equal(of(network, depth).improve(segmentation(truth)).labels, truth)
     assert network.asked == 1
 
 
@@ -174,7 +174,7 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
     v, u = (np.median(each) for each in np.nonzero(truth))
     quarters = np.where(truth > 0, 1 + (rows > v) + 2 * (columns > u), 0).astype(np.int32)
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
-    found = of(network, depth).improved(segmentation(quarters))
+    found = of(network, depth).improve(segmentation(quarters))
     np.testing.assert_array_equal(found.labels, truth)
     assert found.ids == (1,)
     assert not found.outliers.any()
@@ -186,7 +186,7 @@ def test_what_would_be_larger_than_an_object_is_not_joined(max_size: float, obje
     """Two cans, 0.19 m across together, of which each is taken for a part of the other."""
     depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
-    found = replace(of(network, depth), max_size=max_size).improved(segmentation(truth))
+    found = replace(of(network, depth), max_size=max_size).improve(segmentation(truth))
     assert len(found.ids) == objects
 
 
@@ -199,7 +199,7 @@ def test_one_sided_belonging_joins_nothing() -> None:
         claims = np.arange(len(views))[:, None, None] == 0
         return np.where(inside | claims, 3.0, -3.0)
 
-    found = of(GivenLogits(claims_of_the_first), depth).improved(segmentation(truth))
+    found = of(GivenLogits(claims_of_the_first), depth).improve(segmentation(truth))
     assert sorted(found.ids) == [1, 2]
 
 
@@ -216,14 +216,14 @@ def outliers_in_rows(share: float) -> Any:
 
 def test_a_segment_that_is_mostly_outliers_keeps_its_pixels() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(outliers_in_rows(0.55), depth).improved(replace(segmentation(truth), heights=None))
+    found = of(outliers_in_rows(0.55), depth).improve(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
     assert not found.outliers.any()
 
 
 def test_a_segment_that_shows_no_object_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(outliers_in_rows(0.8), depth).improved(segmentation(truth))
+    found = of(outliers_in_rows(0.8), depth).improve(segmentation(truth))
     assert found.ids == ()
     assert not found.labels.any()
 
@@ -233,7 +233,7 @@ def test_without_a_support_nothing_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
     network = SegmentNetwork(outliers_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
-    assert network.improved(replace(segmentation(truth), support=None, heights=None)).ids == (1,)
+    assert network.improve(replace(segmentation(truth), support=None, heights=None)).ids == (1,)
 
 
 def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
@@ -243,7 +243,7 @@ def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
     behind = np.arange(CAMERA.height)[:, None] < np.nonzero(truth)[0].min() - 10
     labels = np.where(behind, 1, 2 * truth).astype(np.int32)
     assert np.count_nonzero(labels == 1) > np.count_nonzero(labels == 2)
-    found = of(shipped, np.where(behind, floor, depth).astype(np.float32)).improved(segmentation(labels))
+    found = of(shipped, np.where(behind, floor, depth).astype(np.float32)).improve(segmentation(labels))
     assert found.ids == (1,)
     np.testing.assert_array_equal(found.labels, truth)
 
@@ -254,7 +254,7 @@ def test_what_is_larger_than_all_of_a_household_is_an_object(shipped: Any, times
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     plane = PLANE * np.array([1.0, 1.0, 1.0, times])
     far = (times * depth).astype(np.float32)
-    assert of(shipped, far, plane=plane).improved(segmentation(truth)).ids == (1,)
+    assert of(shipped, far, plane=plane).improve(segmentation(truth)).ids == (1,)
 
 
 def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
@@ -262,14 +262,14 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     table, camera = Table(distance=1.0), Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
     bodies = [table.body(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
     depth, truth = table.see(bodies, 0.002, camera=camera)
-    found = of(shipped, depth, camera, table.plane).improved(segmentation(truth))
+    found = of(shipped, depth, camera, table.plane).improve(segmentation(truth))
     assert len(found.ids) == 5
 
 
 def test_no_segments_ask_nothing() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: views)
-    assert of(network, depth).improved(segmentation(np.zeros_like(truth))).ids == ()
+    assert of(network, depth).improve(segmentation(np.zeros_like(truth))).ids == ()
     assert network.asked == 0
 
 
@@ -297,9 +297,9 @@ def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quar
     depth, truth = (image[:, 40:280] for image in seen([TABLE.body(0, 0, *CAN)]))
     turned = [np.ascontiguousarray(np.rot90(image, quarters)) for image in (depth, truth)]
     matrix = np.linalg.matrix_power(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters)
-    upright = of(GivenLogits(upper), np.ascontiguousarray(depth), square).improved(segmentation(truth))
+    upright = of(GivenLogits(upper), np.ascontiguousarray(depth), square).improve(segmentation(truth))
     plane = np.append(matrix @ PLANE[:3], PLANE[3])
-    rolled = of(GivenLogits(upper), turned[0], square, plane).improved(segmentation(turned[1]))
+    rolled = of(GivenLogits(upper), turned[0], square, plane).improve(segmentation(turned[1]))
     assert 0.05 < upright.outliers.sum() / (truth > 0).sum() < 0.5
     assert (np.rot90(rolled.outliers, -quarters) != upright.outliers).mean() < 0.005
 

@@ -24,7 +24,7 @@ from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.support_plane import Plane, flat
+from sq_perception.segmentation.support_plane import Plane, flat_surface
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -249,7 +249,7 @@ def test_parting_segments_makes_no_more_objects_than_are_wanted(monkeypatch):
     for k in range(3):
         labels[10:30, 10 + 15 * k : 20 + 15 * k] = k + 1
     parted = FrameEvidence(labels, (1, 2, 3))
-    monkeypatch.setattr(own_segments.SegmentNetwork, "improved", lambda *_: parted)
+    monkeypatch.setattr(own_segments.SegmentNetwork, "improve", lambda *_: parted)
     camera = Camera(64, 48, 60.0, 60.0, 32, 24)
     found = Recoverer().recover(np.ones((48, 64), np.float32), camera, options=RecoveryOptions(max_objects=2))
     assert [body.label for body in found.bodies] == [1, 2]
@@ -263,29 +263,24 @@ def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
     depth, truth = table.see([table.body(-0.1, 0, (0.06, 0.06, 0.05)), table.body(0.12, 0, (0.03, 0.03, 0.03))])
 
     def without_the_largest(_, found):
-        return found.kept(dict.fromkeys(found.ids[1:], 1.0))
+        return found.keep(dict.fromkeys(found.ids[1:], 1.0))
 
-    monkeypatch.setattr(own_segments.SegmentNetwork, "improved", without_the_largest)
+    monkeypatch.setattr(own_segments.SegmentNetwork, "improve", without_the_largest)
     found = Recoverer().recover(depth, VGA, options=RecoveryOptions(max_objects=1))
     assert [body.label for body in found.bodies] == [1]
     assert np.mean(truth[found.labels == 1] == 2) > 0.95
 
 
-def test_half_precision_is_read_as_single_precision(symmetry):
-    """Not even with a warning: the farthest reading is no number of half precision."""
+@pytest.mark.parametrize("form", ["half precision", "masked"])
+def test_the_same_readings_in_another_form_give_the_same_body(symmetry, form):
+    """Of half precision not even with a warning: the farthest reading is no number of it."""
     depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
-    depth = depth.astype(np.float16)
-    half, single = (symmetry.recover(image, CAMERA, labels) for image in (depth, depth.astype(np.float32)))
-    np.testing.assert_array_equal(half.bodies[0].superquadric.to_flat(), single.bodies[0].superquadric.to_flat())
-
-
-def test_masked_readings_are_none(symmetry):
-    depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
-    wrong = np.zeros(depth.shape, bool)
-    wrong[::3] = True
-    spoilt = np.where(wrong, 0.5 * depth, depth)
-    masked, missing = np.ma.masked_array(spoilt, wrong), np.where(wrong, np.nan, depth)
-    found, known = (symmetry.recover(image, CAMERA, labels).bodies[0].superquadric for image in (masked, missing))
+    half, wrong = depth.astype(np.float16), np.indices(depth.shape)[0] % 3 == 0
+    images = {
+        "half precision": (half, half.astype(np.float32)),
+        "masked": (np.ma.masked_array(np.where(wrong, 0.5 * depth, depth), wrong), np.where(wrong, np.nan, depth)),
+    }[form]
+    found, known = (symmetry.recover(image, CAMERA, labels).bodies[0].superquadric for image in images)
     np.testing.assert_array_equal(found.to_flat(), known.to_flat())
 
 
@@ -345,9 +340,9 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     assert small.sum() > 200
     found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
     assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
-    given = FrameEvidence(small, (1,), flat(Plane(scene.plane, 1.0, 1e-3)))
+    given = FrameEvidence(small, (1,), flat_surface(Plane(scene.plane, 1.0, 1e-3)))
     (obj,) = seen_object.objects(depth, given, CAMERA)
-    whole = seen_object.completed(replace(obj, plane=scene.plane), depth, CAMERA, small)
+    whole = seen_object.complete(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()
     assert (whole.mask & ~obj.mask).any() == (pixels > 0)
 

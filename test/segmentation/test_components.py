@@ -12,7 +12,7 @@ CAMERA = Camera(320, 240, 525.0, 525.0, 159.5, 119.5)
 
 def taken_apart(depth, sigma=1e-3):
     depth = depth.astype(np.float32)
-    return segments.taken_apart(depth, depth > 0, CAMERA, sigma)
+    return segments.take_apart(depth, depth > 0, CAMERA, sigma)
 
 
 def test_a_bridge_of_two_pixels_over_a_step_does_not_connect():

@@ -37,14 +37,14 @@ def names(labels):
 @pytest.mark.parametrize("shape", [(1.0, 1.0), (0.1, 0.1), (0.1, 1.0), (0.6, 0.3)])
 def test_a_convex_body_has_one_part(shape, noise):
     depth, truth = seen([body(0, (0.08, 0.05, 0.04), shape, rotation=TILTED)], noise)
-    np.testing.assert_array_equal(convex_parts.corrected(truth, depth, CAMERA, max(noise, 5e-4)), truth)
+    np.testing.assert_array_equal(convex_parts.correct(truth, depth, CAMERA, max(noise, 5e-4)), truth)
 
 
 @pytest.mark.parametrize("noise", [0.0005, 0.003])
 def test_bodies_that_touch_are_parted(noise):
     bodies = [body(-0.1), body(0.0), body(0.1, shape=(0.2, 0.2), rotation=TILTED, size=(0.05, 0.04, 0.04))]
     depth, truth = seen(bodies, noise)
-    found = convex_parts.corrected((truth > 0).astype(np.int32), depth, CAMERA, noise)
+    found = convex_parts.correct((truth > 0).astype(np.int32), depth, CAMERA, noise)
     assert len(names(found)) == 3
     assert min(ious(truth, found)) > 0.9
 
@@ -58,7 +58,7 @@ def test_what_is_not_convex_is_parted_from_what_it_touches():
     ball = Superquadric(np.full(3, 0.035), np.array([1.0, 1.0]), np.array([0.023, 0.058, 0.7]), UPRIGHT)
     depth, index = seen([*bars, ball])
     truth = np.where(index == 3, 2, np.minimum(index, 1))
-    found = convex_parts.corrected((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
+    found = convex_parts.correct((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
     assert len(names(found)) == 2
     assert min(ious(truth, found)) > 0.9
 
@@ -68,7 +68,7 @@ def test_pieces_of_one_body_are_joined_and_those_of_two_are_not():
     v, u = np.indices(truth.shape)
     pieces = np.where(truth > 0, 1 + (u // 20) + 100 * (v // 20) + 10000 * truth, 0)
     pieces = np.unique(pieces, return_inverse=True)[1].reshape(truth.shape).astype(np.int32)
-    found = convex_parts.corrected(pieces, depth, CAMERA, NOISE)
+    found = convex_parts.correct(pieces, depth, CAMERA, NOISE)
     assert pieces.max() >= 8
     assert len(names(found)) == 2
     assert min(ious(truth, found)) > 0.99
@@ -82,7 +82,7 @@ def test_a_bowl_has_no_convex_parts():
     depth = np.where(radius < 0.08, 0.7 + np.sqrt(np.maximum(0.09**2 - radius**2, 0)), 1.0).astype(np.float32)
     mask = radius < 0.08
     labels = mask.astype(np.int32)
-    np.testing.assert_array_equal(convex_parts.corrected(labels, depth, CAMERA, NOISE), labels)
+    np.testing.assert_array_equal(convex_parts.correct(labels, depth, CAMERA, NOISE), labels)
 
 
 def test_a_cup_between_two_balls_is_parted_from_them_and_keeps_its_inside():
@@ -96,7 +96,7 @@ def test_a_cup_between_two_balls_is_parted_from_them_and_keeps_its_inside():
     depth[wall], depth[inside] = (0.68 - bulge)[wall], (0.68 + bulge)[inside]
     truth[wall | inside] = 3
     depth += NOISE * depth**2 * np.random.default_rng(0).standard_normal(depth.shape).astype(np.float32)
-    found = convex_parts.corrected((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
+    found = convex_parts.correct((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
     assert len(names(found)) == 3
     assert min(ious(truth, found)) > 0.7
 
@@ -105,7 +105,7 @@ def test_other_names_give_the_same_segments():
     depth, truth = seen([body(-0.1), body(0.0), body(0.1)])
     one = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
     two = np.array([0, 9, 4], np.int32)[one]
-    first, second = (convex_parts.corrected(labels, depth, CAMERA, NOISE) for labels in (one, two))
+    first, second = (convex_parts.correct(labels, depth, CAMERA, NOISE) for labels in (one, two))
     pairs = np.unique(np.stack([first.ravel(), second.ravel()]), axis=1)
     assert pairs.shape[1] == len(names(first)) + 1 == 4
 
@@ -114,9 +114,9 @@ def test_other_names_give_the_same_segments():
 def test_nothing_to_say_changes_nothing(depth):
     labels = np.zeros((240, 320), np.int32)
     image = np.full(labels.shape, depth, np.float32)
-    np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE), labels)
+    np.testing.assert_array_equal(convex_parts.correct(labels, image, CAMERA, NOISE), labels)
     labels[50:100, 50:100] = 3
-    np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE) > 0, labels > 0)
+    np.testing.assert_array_equal(convex_parts.correct(labels, image, CAMERA, NOISE) > 0, labels > 0)
 
 
 def behind_a_post(tilt=0.0, between=0.5):
@@ -135,7 +135,7 @@ def behind_a_post(tilt=0.0, between=0.5):
 
 
 def of_parts(depth, labels, **options):
-    found = convex_parts.corrected(labels, depth, CAMERA, NOISE, **options)
+    found = convex_parts.correct(labels, depth, CAMERA, NOISE, **options)
     return [found[120, u] for u in (115, 205, 160)]
 
 
@@ -160,4 +160,4 @@ def pot():
 
 def test_an_inside_is_one_with_the_wall_before_it():
     depth, labels = pot()
-    assert len(names(convex_parts.corrected(labels, depth, CAMERA, NOISE))) == 1
+    assert len(names(convex_parts.correct(labels, depth, CAMERA, NOISE))) == 1

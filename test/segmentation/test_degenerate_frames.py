@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -174,30 +175,19 @@ def seen(kind: str, sensor: str, seed: int = 3, camera: Camera = CAMERA) -> Fram
     return Frame(depth, camera, TABLE if "table" in kind else None)
 
 
-NOTHING: dict[str, Callable[[], Frame]] = {
-    "all NaN": lambda: filled(np.nan),
-    "all zero": lambda: filled(0.0),
-    "all infinite": lambda: filled(np.inf),
-    "all negative": lambda: filled(-1.0),
-    "constant": lambda: filled(0.6),
+HOLED = ("every other pixel", "squares", "a column", "a row", "a diagonal", "a pixel")
+NOISES = ("uniform", "salt and pepper", "extreme", "of both signs", "rarely a number")
+VALUES = {"NaN": np.nan, "zero": 0.0, "infinite": np.inf, "negative": -1.0, "0.6 m": 0.6}
+SIZES = ((1, 1), (2, 2), (640, 3), (3, 480), (16, 16))
+FRAMES: dict[str, Callable[[], Frame]] = {
+    **{f"all {name}": partial(filled, value) for name, value in VALUES.items()},
     "table cut by the border": table_cut_by_the_border,
-    **{f"wall, {kind}": lambda kind=kind: holed(kind) for kind in ("every other pixel", "squares")},
-    **{f"wall, {kind}": lambda kind=kind: holed(kind) for kind in ("a column", "a row", "a diagonal", "a pixel")},
-    **{
-        f"noise, {kind}": lambda kind=kind: noise(kind)
-        for kind in ("uniform", "salt and pepper", "extreme", "of both signs", "rarely a number")
-    },
+    **{f"wall, {kind}": partial(holed, kind) for kind in HOLED},
+    **{f"noise, {kind}": partial(noise, kind) for kind in NOISES},
+    **{f"hand over the lens {seed}": partial(hand_over_the_lens, seed) for seed in range(2)},
+    **{f"box at 5 cm turned by {degrees} degrees": partial(box_close_by, degrees) for degrees in (0, 45)},
+    **{f"{w} x {h} {shown}": partial(small, w, h, shown) for w, h in SIZES for shown in ("wall", "steps", "nothing")},
 }
-NEAR: dict[str, Callable[[], Frame]] = {
-    **{f"hand over the lens {seed}": lambda seed=seed: hand_over_the_lens(seed) for seed in range(2)},
-    **{f"box at 5 cm turned by {a} degrees": lambda a=a: box_close_by(a) for a in (0, 45)},
-}
-SIZES: dict[str, Callable[[], Frame]] = {
-    f"{width} x {height} {shown}": lambda width=width, height=height, shown=shown: small(width, height, shown)
-    for width, height in ((1, 1), (2, 2), (640, 3), (3, 480), (16, 16))
-    for shown in ("wall", "steps", "nothing")
-}
-FRAMES = {**NOTHING, **NEAR, **SIZES}
 
 
 # Masks from outside

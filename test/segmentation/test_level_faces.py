@@ -49,12 +49,12 @@ def supported(depth):
     """The support of an image, and its depth with 0 where there is none."""
     valid = np.isfinite(depth)
     known = np.where(valid, depth, np.float32(0))
-    return support_plane.measured(support_plane.support(depth, valid, VGA), known, valid, VGA), known
+    return support_plane.fit_surface(support_plane.support(depth, valid, VGA), known, valid, VGA), known
 
 
 def faces(labels, known, support):
     segments = level_faces.samples(labels, known, VGA, 100)
-    return level_faces.found(segments, labels, known, VGA, support, 100)
+    return level_faces.find_faces(segments, labels, known, VGA, support, 100)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -66,14 +66,14 @@ def test_the_face_is_that_of_the_carton(seed):
     depth, truth = table.see(bodies, 2e-3, seed)
     labels = np.where(truth == 2, 1, truth).astype(np.int32)
     support, known = supported(depth)
-    (face,) = faces(labels, known, support)
-    assert face.label == 1
-    assert face.surface.plane.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
+    ((label, face),) = faces(labels, known, support).items()
+    assert label == 1
+    assert face.plane.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
     middle = table.origin + TOP * table.plane[:3]
-    assert face.surface.plane.height(middle) == pytest.approx(0, abs=2e-3)
-    under = face.under(labels, known, VGA)
-    assert under[truth == 1].all()
-    assert not under[truth == 3].any()
+    assert face.plane.height(middle) == pytest.approx(0, abs=2e-3)
+    above = level_faces.find_above(1, face, labels, known, VGA)
+    assert above[truth == 1].all()
+    assert not above[truth == 3].any()
 
 
 def test_the_seat_of_a_stool_is_a_face_though_it_is_the_lowest_that_is_seen_of_it():
@@ -81,8 +81,8 @@ def test_the_seat_of_a_stool_is_a_face_though_it_is_the_lowest_that_is_seen_of_i
     seat = table.body(0, 0, (0.18, 0.18, 0.015), (0.1, 1.0), height=0.42)
     depth, truth = table.see([seat, table.body(0, 0, (0.03, 0.02, 0.015), height=0.45)], 1e-3)
     support, known = supported(depth)
-    (face,) = faces((truth > 0).astype(np.int32), known, support)
-    assert face.surface.plane.height(table.origin + 0.45 * table.plane[:3]) == pytest.approx(0, abs=2e-3)
+    (face,) = faces((truth > 0).astype(np.int32), known, support).values()
+    assert face.plane.height(table.origin + 0.45 * table.plane[:3]) == pytest.approx(0, abs=2e-3)
 
 
 def test_a_carton_without_a_load_and_a_thing_without_a_level_face_are_left_alone():
@@ -90,7 +90,7 @@ def test_a_carton_without_a_load_and_a_thing_without_a_level_face_are_left_alone
     ball = table.body(0.3, 0.0, (0.1, 0.1, 0.1), (1.0, 1.0))
     depth, truth = table.see([table.body(-0.05, 0, CARTON, EDGES), ball], 2e-3)
     support, known = supported(depth)
-    assert faces(truth, known, support) == []
+    assert faces(truth, known, support) == {}
 
 
 def test_the_bottom_of_a_vessel_is_no_face():
@@ -99,7 +99,7 @@ def test_the_bottom_of_a_vessel_is_no_face():
     walls = [table.body(x, y, (0.1 if y else 0.004, 0.1 if x else 0.004, 0.04)) for x, y in _SIDES]
     depth, truth = table.see([table.body(0, 0, (0.1, 0.1, 0.006)), *walls], 2e-3)
     support, known = supported(depth)
-    assert faces((truth > 0).astype(np.int32), known, support) == []
+    assert faces((truth > 0).astype(np.int32), known, support) == {}
 
 
 _SIDES = ((0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1))

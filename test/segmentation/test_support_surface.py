@@ -13,7 +13,7 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.options import SegmentationOptions, largest_edge
-from sq_perception.segmentation.segments import from_labels, proposed, segment
+from sq_perception.segmentation.segments import from_labels, propose, segment
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -71,12 +71,12 @@ def test_the_bend_is_measured_and_a_flat_table_has_next_to_none():
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
     plane = support_plane.support(depth, np.isfinite(depth), CAMERA)
-    surface = support_plane.measured(plane, depth, np.isfinite(depth), CAMERA)
+    surface = support_plane.fit_surface(plane, depth, np.isfinite(depth), CAMERA)
     expected = -bulge * CAMERA.fx**2 / (CAMERA.cx**2 + CAMERA.cy**2) / away**2
     assert surface.bend[[3, 5]] == pytest.approx([expected, expected], rel=0.15)
     assert surface.sigma == pytest.approx(5e-4, rel=0.25)
     flat = noisy(np.full((240, 320), away), 5e-4)
-    surface = support_plane.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA)
+    surface = support_plane.fit_surface(plane_of(flat), flat, np.isfinite(flat), CAMERA)
     assert np.abs(surface.bend).max() < 0.02 * abs(expected)
 
 
@@ -131,7 +131,7 @@ def test_bumps_where_the_noise_is_large_are_no_things(seed):
     depth = noisy(table - 0.025 * thing, 1e-3, seed) + np.where(u > 210, 0.01 * waves / waves.std(), 0)
     found = judged_by_network(depth.astype(np.float32), CAMERA)
     assert best_iou(thing, found.labels) > 0.8
-    assert 3 * len(found.ids) < len(proposed(depth.astype(np.float32), CAMERA).ids)
+    assert 3 * len(found.ids) < len(propose(depth.astype(np.float32), CAMERA).ids)
 
 
 @pytest.mark.parametrize("seed", range(3))
