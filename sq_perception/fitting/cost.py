@@ -13,6 +13,7 @@ branches, which is what vectorises.
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -21,40 +22,41 @@ from sq_perception.geometry.elementary import log2
 from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.imaging.camera import Lens
 
-ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, DEPTH, STIFFNESS, WEIGHT = range(7)
+Ray = IntEnum("Ray", "ORIGIN_X ORIGIN_Y DIRECTION_X DIRECTION_Y DEPTH STIFFNESS WEIGHT OFFSET SIDE", start=0)
 """Columns of a ray.
 
 DEPTH, metres: what the pixel measured; for a free ray, up to where its space is empty.  STIFFNESS, 1 / metres:
 1 / sigma of the depth; 1 for a free ray, whose sigma is the outline's.  WEIGHT: as how many rays it counts.
+
+Of points without a camera, which lie at (ORIGIN_X, ORIGIN_Y, DEPTH): OFFSET, metres: the distance to expect.  SIDE: 0
+for a point of the surface; 1 or -1 for one outside or inside, wherever that is.
 """
-RAY_COLUMNS = 7
+RAY_COLUMNS = len(Ray)
 SAMPLE = 800
 """Object rays that determine a mean, a share or a median to 1 to 3 %, and take a tenth of a fit's time."""
 STEP_LENGTH, PARAMETERS = 13, 10
 LANES = 64
 """Residuals of a block: eight of the longest vectors, with all rows in the nearest cache (6 of its 32 KiB or more)."""
-_SMALL = 1e-300
-_LN_2 = math.log(2.0)
 
 
 class Rays(NamedTuple):
     """The rays that one stage of a fit draws."""
 
     hits: np.ndarray
-    """Rays (n, 7) of the object's pixels."""
+    """Rays (n, 9) of the object's pixels."""
     free: np.ndarray
-    """Rays (m, 7) of pixels beside the object."""
+    """Rays (m, 9) of pixels beside the object."""
 
     @property
     def weight(self) -> float:
         """Total weight of the object's rays: the cost of a body that leaves nothing but noise."""
-        return float(self.hits[:, WEIGHT].sum())
+        return float(self.hits[:, Ray.WEIGHT].sum())
 
-    def weighing(self, factor: float) -> Rays:
+    def scale(self, factor: float) -> Rays:
         """The same rays with all weights times a factor."""
         hits, free = self.hits.copy(), self.free.copy()
-        hits[:, WEIGHT] *= factor
-        free[:, WEIGHT] *= factor
+        hits[:, Ray.WEIGHT] *= factor
+        free[:, Ray.WEIGHT] *= factor
         return Rays(hits, free)
 
     def every(self, stride: int) -> Rays:
@@ -106,14 +108,14 @@ def huber_loss(residual: float, huber: float, weight: float) -> tuple[float, flo
     size = abs(residual)
     inner = min(size, huber)
     loss = weight * inner * (2.0 * size - inner)
-    return loss, math.sqrt(weight * min(1.0, huber / max(size, _SMALL)))
+    return loss, math.sqrt(weight * min(1.0, huber / max(size, 1e-300)))
 
 
 @inline_kernel
 def cauchy_loss(residual: float, scale: float, weight: float) -> tuple[float, float]:
     """Cauchy's loss, which almost stops growing beyond ``scale``, and the square root of its weight; no branch."""
     above = 1.0 + residual * residual / (scale * scale)
-    return _LN_2 * weight * scale * scale * log2(above), math.sqrt(weight / above)
+    return math.log(2.0) * weight * scale * scale * log2(above), math.sqrt(weight / above)
 
 
 @kernel
@@ -142,7 +144,17 @@ def add_row(row: np.ndarray, sums: np.ndarray) -> None:
 
 
 @kernel
-def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
+def rays_of(points: np.ndarray) -> np.ndarray:
+    """Rays (n, 9) of points (n, 3) without a camera, each of weight 1."""
+    rays = np.zeros((points.shape[0], RAY_COLUMNS))
+    rays[:, Ray.ORIGIN_X], rays[:, Ray.ORIGIN_Y], rays[:, Ray.DEPTH] = points[:, 0], points[:, 1], points[:, 2]
+    rays[:, Ray.STIFFNESS] = 1.0
+    rays[:, Ray.WEIGHT] = 1.0
+    return rays
+
+
+@kernel
+def draw(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
     """All of the pixels (n,), or about ``count`` of them, systematically by their areas.
 
     Other offsets (0 to 1) take other pixels.
@@ -168,10 +180,10 @@ def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> n
 
 
 @kernel
-def through(
+def rays_through(
     pixels: np.ndarray, depth: np.ndarray, lens: Lens, noise: float, model_error: float, margin: float
 ) -> np.ndarray:
-    """Rays (n, 7) through pixels, indices into the depth image; free ones end a margin before the reading.
+    """Rays (n, 9) through pixels, indices into the depth image; free ones end a margin before the reading.
 
     Noise and model error join in squares; ``margin``: in such standard deviations, 0 for rays of the object.
     """
@@ -183,15 +195,15 @@ def through(
         v, u = pixels[i] // width, pixels[i] % width
         x, y = (u - cx) / fx, (v - cy) / fy
         if pinhole:
-            rays[i, DIRECTION_X], rays[i, DIRECTION_Y] = x, y
+            rays[i, Ray.DIRECTION_X], rays[i, Ray.DIRECTION_Y] = x, y
         else:
-            rays[i, ORIGIN_X], rays[i, ORIGIN_Y] = x, y
+            rays[i, Ray.ORIGIN_X], rays[i, Ray.ORIGIN_Y] = x, y
         z = np.float64(depth[v, u])
-        rays[i, STIFFNESS] = rays[i, WEIGHT] = 1.0
+        rays[i, Ray.STIFFNESS] = rays[i, Ray.WEIGHT] = 1.0
         if not np.isfinite(z):
-            rays[i, DEPTH] = 1e300
+            rays[i, Ray.DEPTH] = 1e300
             continue
-        rays[i, DEPTH] = z - margin * sigma
+        rays[i, Ray.DEPTH] = z - margin * sigma
         if margin == 0.0:
-            rays[i, STIFFNESS] = 1.0 / sigma
+            rays[i, Ray.STIFFNESS] = 1.0 / sigma
     return rays

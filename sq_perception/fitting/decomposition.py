@@ -26,9 +26,11 @@ from typing import Any
 import numpy as np
 
 from sq_perception.fitting import point_cost, points
+from sq_perception.fitting.cost import STEP_LENGTH
 from sq_perception.fitting.fit import Parts
 from sq_perception.fitting.point_cloud import UnitCloud
-from sq_perception.fitting.point_cost import Cloud, Course, Mixture, Prior
+from sq_perception.fitting.point_cost import Cloud, Course, Mixture
+from sq_perception.fitting.starts import principal_axes
 
 MOST_PARTS = 6
 _POINTS, _PROBES = 800, 800
@@ -39,10 +41,6 @@ _RESOLUTION = 0.01
 """Least noise, in radii of the cloud: what a part may stray from a superquadric without another part."""
 _GRID = 28
 """Cells along the longest side of the grid that tells inside from outside."""
-_ENCLOSED = 0.1
-"""Least volume inside, as a share of the cells with points, of a cloud that closes one."""
-_CLUSTER = 0.5
-"""Radius of a group of points that no body explains."""
 _QUICK, _THOROUGH = 8, 30
 """Rounds of a candidate, and of the union that goes on."""
 
@@ -74,13 +72,13 @@ def decompose(
         raise ValueError(f"most: expected 1 or more parts, got {most}")
     given, normals = points.surface_of(thing, normals)
     cloud = UnitCloud.of(given, normals, points.MOST_POINTS)
-    reason = points.why_unfit(cloud)
+    reason = points.reason_to_fail(cloud)
     if reason:
-        alone = points.unfit(cloud, reason, began)
+        alone = points.fail(cloud, reason, began)
         return Parts((alone,), np.zeros(1), alone.status, reason, math.nan, alone.milliseconds)
-    search = _Search(cloud, _with_probes(cloud, given), points.prior_of(cloud, True), sigma)
-    mixture = search.pruned(search.grown(most))
-    return _assessed(cloud, mixture, began)
+    search = _Search(cloud, _with_probes(cloud, given), sigma)
+    mixture = search.prune(search.grow(most))
+    return _assess(cloud, mixture, began)
 
 
 def decompose_all(things: Sequence[Any], *, most: int = MOST_PARTS, jobs: int | None = None) -> list[Parts]:
@@ -92,30 +90,31 @@ def decompose_all(things: Sequence[Any], *, most: int = MOST_PARTS, jobs: int | 
 class _Search:
     """The unions of a cloud, from one body to the most."""
 
-    def __init__(self, cloud: UnitCloud, data: Cloud, prior: Prior, sigma: float | None) -> None:
-        self._cloud, self._data, self._prior = cloud, data, prior
+    def __init__(self, cloud: UnitCloud, data: Cloud, sigma: float | None) -> None:
+        self._cloud, self._data, self._limits = cloud, data, points.limits_of(cloud, True)
         self._least = _RESOLUTION if sigma is None else max(sigma / cloud.scale, 1e-4)
 
-    def grown(self, most: int) -> Mixture:
+    def grow(self, most: int) -> Mixture:
         """The union of the shortest description; growing ends when two more bodies in a row do not shorten it."""
-        start = points.searched(self._cloud, None, "auto", True, points.STAGES_OF_PARTS)
-        best = current = self._settled(start._replace(share=min(start.share, 0.3)), _THOROUGH)
+        start = points.search(self._cloud, None, "auto", True, points.STAGES_OF_PARTS)
+        best = current = self._maximize(start._replace(share=min(start.share, 0.3)), _THOROUGH)
         misses = 0
         while len(current.bodies) < most and misses < 2:
-            candidates = [self._settled(each, _QUICK) for each in self._candidates(current)]
+            candidates = [self._maximize(each, _QUICK) for each in self._candidates(current)]
             if not candidates:
                 break
             candidates.sort(key=lambda each: -each.likelihood)
-            current = max((self._settled(each, _THOROUGH) for each in candidates[:2]), key=lambda each: each.likelihood)
+            followed = [self._maximize(each, _THOROUGH) for each in candidates[:2]]
+            current = max(followed, key=lambda each: each.likelihood)
             misses = 0 if self.description(current) < self.description(best) else misses + 1
             best = best if misses else current
         return best
 
-    def pruned(self, mixture: Mixture) -> Mixture:
+    def prune(self, mixture: Mixture) -> Mixture:
         """The union without the bodies that do not shorten its description."""
         while len(mixture.bodies) > 1:
             fewer = [
-                self._settled(
+                self._maximize(
                     mixture._replace(bodies=np.delete(mixture.bodies, k, 0), turns=np.delete(mixture.turns, k, 0)),
                     _THOROUGH,
                 )
@@ -129,12 +128,12 @@ class _Search:
 
     def description(self, mixture: Mixture) -> float:
         """D above."""
-        of_body = 0.5 * point_cost.STEP_LENGTH * math.log(_WITNESSES)
+        of_body = 0.5 * STEP_LENGTH * math.log(_WITNESSES)
         return -_WITNESSES / len(self._data.points) * mixture.likelihood + of_body * len(mixture.bodies)
 
-    def _settled(self, mixture: Mixture, rounds: int) -> Mixture:
+    def _maximize(self, mixture: Mixture, rounds: int) -> Mixture:
         course = Course(False, False, self._least, rounds, 1e-3, False)
-        return point_cost.settle(self._data, mixture, self._prior, course)
+        return point_cost.maximize(self._data, mixture, points.PRIOR, self._limits, course)
 
     def _candidates(self, mixture: Mixture) -> Iterator[Mixture]:
         bodies, turns = mixture.bodies, mixture.turns
@@ -174,12 +173,11 @@ def _box_of_group(some: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
 
     if len(some) < 2 * points.MIN_PIXELS:
         return None
-    near = cKDTree(some).query_ball_point(some, _CLUSTER)
+    near = cKDTree(some).query_ball_point(some, 0.5)
     group = some[near[int(np.argmax([len(each) for each in near]))]]
     if len(group) < points.MIN_PIXELS:
         return None
-    turn = np.linalg.eigh(np.cov(group.T))[1]
-    turn *= math.copysign(1.0, float(np.linalg.det(turn)))
+    turn = principal_axes(np.cov(group.T))
     low, high = (group @ turn).min(axis=0), (group @ turn).max(axis=0)
     half = np.maximum((high - low) / 2, 0.05)
     return np.array([*half, 0.5, 0.5, *(turn @ (low + high) / 2), 0.0, 0.0]), np.ascontiguousarray(turn)
@@ -202,7 +200,7 @@ def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
     labels, _ = ndimage.label(~wall)
     outside = labels == labels[0, 0, 0]
     inside = ~wall & ~outside
-    if np.count_nonzero(inside) < _ENCLOSED * np.count_nonzero(occupied):
+    if np.count_nonzero(inside) < 0.1 * np.count_nonzero(occupied):  # the points close no volume
         return surface
     probes, sides = [], []
     for cell, sign in ((outside, 1.0), (inside, -1.0)):
@@ -217,9 +215,9 @@ def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
     )
 
 
-def _assessed(cloud: UnitCloud, mixture: Mixture, began: float) -> Parts:
+def _assess(cloud: UnitCloud, mixture: Mixture, began: float) -> Parts:
     surface = cloud.surface()
     none = np.zeros((len(cloud.points), len(mixture.bodies)))
     shares = point_cost.shares(surface, mixture, none)[0].mean(axis=0)
-    fits = [points.assessed(cloud, mixture, k, began) for k in range(len(shares))]
+    fits = [points.assess(cloud, mixture, k, began) for k in range(len(shares))]
     return Parts.of(fits, shares, mixture.sigma * cloud.scale, (time.perf_counter() - began) * 1e3)

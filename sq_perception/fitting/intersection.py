@@ -11,31 +11,25 @@ falling slope, is found by Newton's method; how near a ray that misses passes, b
 from __future__ import annotations
 
 import math
+from enum import IntEnum
 
 import numpy as np
 
-from sq_perception.fitting.cost import (
-    DEPTH,
-    DIRECTION_X,
-    DIRECTION_Y,
-    LANES,
-    ORIGIN_X,
-    ORIGIN_Y,
-    STIFFNESS,
-    WEIGHT,
-    Terms,
-)
+from sq_perception.fitting.cost import LANES, Ray, Terms
 from sq_perception.geometry.kernels import Form, gauge_derivatives, in_object_frame, inline_kernel, inside_box, kernel
 
-QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)
-"""Rows of a ray in the object frame, q + shift e."""
-G, GX, GY, GZ, G1, G2, GK1, GK2, SLOPE = range(7, 16)
-"""Rows of the gauge there and its derivatives, the last one along the ray."""
-MEASURED, PRECISION, SHARE, START = range(16, 20)
-"""Rows of what the pixel measured, 1 / sigma and weight of the ray, and the depth of q."""
-LOW, HIGH, G_LOW, G_HIGH, S_LOW, S_HIGH = range(20, 26)
-"""Rows of a bracket around the smallest gauge."""
-ROWS = 26
+Lane = IntEnum(
+    "Lane",
+    # The ray in the object frame, q + shift e; the gauge there and its derivatives, the last one along the ray.
+    "QX QY QZ EX EY EZ SHIFT G GX GY GZ G1 G2 GK1 GK2 SLOPE "
+    # What the pixel measured, 1 / sigma and weight of the ray, the depth of q, OFFSET and SIDE.
+    "MEASURED PRECISION SHARE START EXPECTED ONE_SIDED "
+    # A bracket around the smallest gauge.
+    "LOW HIGH G_LOW G_HIGH S_LOW S_HIGH",
+    start=0,
+)
+"""Rows of a ray in a block."""
+ROWS = len(Lane)
 _VECTOR = 8
 """Doubles of the longest vectors of today's processors, 512 bits."""
 
@@ -43,10 +37,6 @@ _HIT_STEPS = 12
 """Most steps of Newton's method on a convex function; it converges quadratically, most rays need 2."""
 _LOWEST_STEPS, LOWEST_TOLERANCE = 20, 1e-9
 """Most steps to the smallest gauge on a ray, and how near to a lower bound of it they end."""
-_ANY, _COVERED_TOLERANCE = 1e300, 1e-6
-"""Gauge that matters, and tolerance, for a ray that should meet the body but misses it: any distance matters."""
-_NEAREST = 1e-3
-"""Distance in front of a pinhole camera at which a free ray starts, metres."""
 _FAR_OUTSIDE = 2.0
 """Gauge above which Newton's method starts where the ray enters the bounding box instead."""
 
@@ -60,19 +50,20 @@ def place(part: np.ndarray, met: np.ndarray, parameters: np.ndarray, rotation: n
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
     for i in range(part.shape[0]):
-        dx, dy = part[i, DIRECTION_X], part[i, DIRECTION_Y]
-        start = met[i] if met.shape[0] > 0 else part[i, DEPTH]
-        x, y, z = part[i, ORIGIN_X] - t1 + start * dx, part[i, ORIGIN_Y] - t2 + start * dy, start - t3
-        lanes[QX, i] = m11 * x + m21 * y + m31 * z
-        lanes[QY, i] = m12 * x + m22 * y + m32 * z
-        lanes[QZ, i] = m13 * x + m23 * y + m33 * z
-        lanes[EX, i] = m11 * dx + m21 * dy + m31
-        lanes[EY, i] = m12 * dx + m22 * dy + m32
-        lanes[EZ, i] = m13 * dx + m23 * dy + m33
-        lanes[SHIFT, i] = 0.0
-        lanes[MEASURED, i] = part[i, DEPTH]
-        lanes[PRECISION, i], lanes[SHARE, i] = part[i, STIFFNESS], part[i, WEIGHT]
-        lanes[START, i] = start
+        dx, dy = part[i, Ray.DIRECTION_X], part[i, Ray.DIRECTION_Y]
+        start = met[i] if met.shape[0] > 0 else part[i, Ray.DEPTH]
+        x, y, z = part[i, Ray.ORIGIN_X] - t1 + start * dx, part[i, Ray.ORIGIN_Y] - t2 + start * dy, start - t3
+        lanes[Lane.QX, i] = m11 * x + m21 * y + m31 * z
+        lanes[Lane.QY, i] = m12 * x + m22 * y + m32 * z
+        lanes[Lane.QZ, i] = m13 * x + m23 * y + m33 * z
+        lanes[Lane.EX, i] = m11 * dx + m21 * dy + m31
+        lanes[Lane.EY, i] = m12 * dx + m22 * dy + m32
+        lanes[Lane.EZ, i] = m13 * dx + m23 * dy + m33
+        lanes[Lane.SHIFT, i] = 0.0
+        lanes[Lane.MEASURED, i] = part[i, Ray.DEPTH]
+        lanes[Lane.PRECISION, i], lanes[Lane.SHARE, i] = part[i, Ray.STIFFNESS], part[i, Ray.WEIGHT]
+        lanes[Lane.EXPECTED, i], lanes[Lane.ONE_SIDED, i] = part[i, Ray.OFFSET], part[i, Ray.SIDE]
+        lanes[Lane.START, i] = start
 
 
 @kernel
@@ -81,7 +72,7 @@ def padded(count: int, lanes: np.ndarray) -> int:
     filled = (count + _VECTOR - 1) // _VECTOR * _VECTOR
     for i in range(count, filled):
         lanes[:, i] = lanes[:, count - 1]
-        lanes[SHARE, i] = 0.0
+        lanes[Lane.SHARE, i] = 0.0
     return filled
 
 
@@ -96,12 +87,12 @@ def gauge_along(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
     """Write the gauge and its derivatives at q + shift e to the lanes."""
     a1, a2, a3, e1, e2, k1, k2 = form_of(parameters)
     for i in range(filled):
-        ex, ey, ez, shift = lanes[EX, i], lanes[EY, i], lanes[EZ, i], lanes[SHIFT, i]
-        x, y, z = lanes[QX, i] + shift * ex, lanes[QY, i] + shift * ey, lanes[QZ, i] + shift * ez
+        ex, ey, ez, shift = lanes[Lane.EX, i], lanes[Lane.EY, i], lanes[Lane.EZ, i], lanes[Lane.SHIFT, i]
+        x, y, z = lanes[Lane.QX, i] + shift * ex, lanes[Lane.QY, i] + shift * ey, lanes[Lane.QZ, i] + shift * ez
         g, gx, gy, gz, g1, g2, gk1, gk2 = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2, k1, k2)
-        lanes[G, i], lanes[GX, i], lanes[GY, i], lanes[GZ, i] = g, gx, gy, gz
-        lanes[G1, i], lanes[G2, i], lanes[GK1, i], lanes[GK2, i] = g1, g2, gk1, gk2
-        lanes[SLOPE, i] = gx * ex + gy * ey + gz * ez
+        lanes[Lane.G, i], lanes[Lane.GX, i], lanes[Lane.GY, i], lanes[Lane.GZ, i] = g, gx, gy, gz
+        lanes[Lane.G1, i], lanes[Lane.G2, i], lanes[Lane.GK1, i], lanes[Lane.GK2, i] = g1, g2, gk1, gk2
+        lanes[Lane.SLOPE, i] = gx * ex + gy * ey + gz * ez
 
 
 @kernel
@@ -117,23 +108,23 @@ def meet(
     """
     gauge_along(filled, parameters, lanes)
     for i in range(filled):
-        missed[i] = lanes[SLOPE, i] >= 0.0 or lanes[G, i] > _FAR_OUTSIDE
+        missed[i] = lanes[Lane.SLOPE, i] >= 0.0 or lanes[Lane.G, i] > _FAR_OUTSIDE
     for _ in range(_HIT_STEPS):
         moving = 0
         for i in range(filled):
-            over = 1.0 - lanes[G, i]
-            moves = abs(over) >= tolerance and lanes[SLOPE, i] < 0.0 and not missed[i]
-            lanes[SHIFT, i] += over / lanes[SLOPE, i] if moves else 0.0
+            over = 1.0 - lanes[Lane.G, i]
+            moves = abs(over) >= tolerance and lanes[Lane.SLOPE, i] < 0.0 and not missed[i]
+            lanes[Lane.SHIFT, i] += over / lanes[Lane.SLOPE, i] if moves else 0.0
             moving += moves
         if moving == 0:
             break
         gauge_along(filled, parameters, lanes)
         for i in range(filled):
-            missed[i] = missed[i] or lanes[SLOPE, i] >= 0.0
+            missed[i] = missed[i] or lanes[Lane.SLOPE, i] >= 0.0
     count = 0
     for i in range(filled):
         if missed[i]:
-            for row in range(QX, SHIFT):
+            for row in range(Lane.QX, Lane.SHIFT):
                 again[row, count] = lanes[row, i]
             count += 1
     if count == 0:
@@ -142,9 +133,9 @@ def meet(
     count = 0
     for i in range(filled):
         if missed[i]:
-            for row in range(SHIFT, SLOPE + 1):
+            for row in range(Lane.SHIFT, Lane.MEASURED):
                 lanes[row, i] = again[row, count]
-            missed[i] = again[SHARE, count] == 0.0
+            missed[i] = again[Lane.SHARE, count] == 0.0
             count += 1
 
 
@@ -153,19 +144,20 @@ def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes:
     """As :func:`meet`, from where the rays enter the bounding box; SHARE is 1 for rays that meet the surface, else
     0."""
     for i in range(filled):
-        qx, qy, qz = lanes[QX, i], lanes[QY, i], lanes[QZ, i]
-        ex, ey, ez = lanes[EX, i], lanes[EY, i], lanes[EZ, i]
+        qx, qy, qz = lanes[Lane.QX, i], lanes[Lane.QY, i], lanes[Lane.QZ, i]
+        ex, ey, ez = lanes[Lane.EX, i], lanes[Lane.EY, i], lanes[Lane.EZ, i]
         t_in, t_out = inside_box((qx, qy, qz), (ex, ey, ez), form_of(parameters))
         inside = t_in <= t_out
-        lanes[SHARE, i] = 1.0 if inside else 0.0
-        lanes[SHIFT, i] = lanes[LOW, i] = t_in if inside else 0.0
+        lanes[Lane.SHARE, i] = 1.0 if inside else 0.0
+        lanes[Lane.SHIFT, i] = lanes[Lane.LOW, i] = t_in if inside else 0.0
     gauge_along(filled, parameters, lanes)
     for _ in range(_HIT_STEPS):
         moving = 0
         for i in range(filled):
-            moves = lanes[SHARE, i] > 0.0 and lanes[SLOPE, i] < 0.0 and abs(lanes[G, i] - 1.0) >= tolerance
-            lanes[LOW, i] = lanes[SHIFT, i] if moves else lanes[LOW, i]
-            lanes[SHIFT, i] += (1.0 - lanes[G, i]) / lanes[SLOPE, i] if moves else 0.0
+            is_off = lanes[Lane.SHARE, i] > 0.0 and abs(lanes[Lane.G, i] - 1.0) >= tolerance
+            moves = is_off and lanes[Lane.SLOPE, i] < 0.0
+            lanes[Lane.LOW, i] = lanes[Lane.SHIFT, i] if moves else lanes[Lane.LOW, i]
+            lanes[Lane.SHIFT, i] += (1.0 - lanes[Lane.G, i]) / lanes[Lane.SLOPE, i] if moves else 0.0
             moving += moves
         if moving == 0:
             break
@@ -173,14 +165,15 @@ def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes:
     # Newton's method passes the smallest g of a ray that misses: it lies between the last two points.
     passed = 0
     for i in range(filled):
-        open_bracket = lanes[SHARE, i] > 0.0 and lanes[SLOPE, i] >= 0.0 and abs(lanes[G, i] - 1.0) >= tolerance
-        lanes[HIGH, i] = lanes[SHIFT, i]
-        lanes[LOW, i] = lanes[LOW, i] if open_bracket else lanes[SHIFT, i]
-        lanes[SHARE, i] = 0.0 if open_bracket else lanes[SHARE, i]
+        is_off = lanes[Lane.SHARE, i] > 0.0 and abs(lanes[Lane.G, i] - 1.0) >= tolerance
+        open_bracket = is_off and lanes[Lane.SLOPE, i] >= 0.0
+        lanes[Lane.HIGH, i] = lanes[Lane.SHIFT, i]
+        lanes[Lane.LOW, i] = lanes[Lane.LOW, i] if open_bracket else lanes[Lane.SHIFT, i]
+        lanes[Lane.SHARE, i] = 0.0 if open_bracket else lanes[Lane.SHARE, i]
         passed += open_bracket
     if passed > 0:
         above = np.empty(LANES, np.bool_)
-        lowest(filled, _ANY, _COVERED_TOLERANCE, parameters, lanes, above)
+        lowest(filled, 1e300, 1e-6, parameters, lanes, above)  # any distance matters
 
 
 @inline_kernel
@@ -188,18 +181,18 @@ def enter(
     ray: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, i: int, lanes: np.ndarray
 ) -> int:
     """Put a free ray into lane i if it crosses the bounding box in free space; 1 if so, 0 if not."""
-    x, y, z = ray[ORIGIN_X] - parameters[5], ray[ORIGIN_Y] - parameters[6], -parameters[7]
+    x, y, z = ray[Ray.ORIGIN_X] - parameters[5], ray[Ray.ORIGIN_Y] - parameters[6], -parameters[7]
     origin = in_object_frame(rotation, x, y, z)
-    way = in_object_frame(rotation, ray[DIRECTION_X], ray[DIRECTION_Y], 1.0)
+    way = in_object_frame(rotation, ray[Ray.DIRECTION_X], ray[Ray.DIRECTION_Y], 1.0)
     t_in, t_out = inside_box(origin, way, form_of(parameters))
-    low = max(t_in, _NEAREST if terms.pinhole > 0.0 else -1e300)
-    high = min(t_out, ray[DEPTH])
+    low = max(t_in, 1e-3 if terms.pinhole > 0.0 else -1e300)  # from a millimetre before a pinhole camera on
+    high = min(t_out, ray[Ray.DEPTH])
     if low >= high:
         return 0
-    lanes[QX, i], lanes[QY, i], lanes[QZ, i] = origin
-    lanes[EX, i], lanes[EY, i], lanes[EZ, i] = way
-    lanes[LOW, i], lanes[HIGH, i] = low, high
-    lanes[PRECISION, i], lanes[SHARE, i] = ray[STIFFNESS], ray[WEIGHT]
+    lanes[Lane.QX, i], lanes[Lane.QY, i], lanes[Lane.QZ, i] = origin
+    lanes[Lane.EX, i], lanes[Lane.EY, i], lanes[Lane.EZ, i] = way
+    lanes[Lane.LOW, i], lanes[Lane.HIGH, i] = low, high
+    lanes[Lane.PRECISION, i], lanes[Lane.SHARE, i] = ray[Ray.STIFFNESS], ray[Ray.WEIGHT]
     return 1
 
 
@@ -215,25 +208,26 @@ def lowest(
     """
     for i in range(filled):
         missed[i] = False
-        lanes[SHIFT, i] = lanes[LOW, i]
+        lanes[Lane.SHIFT, i] = lanes[Lane.LOW, i]
     gauge_along(filled, parameters, lanes)
     for i in range(filled):
-        lanes[G_LOW, i], lanes[S_LOW, i] = lanes[G, i], lanes[SLOPE, i]
-        lanes[SHIFT, i] = lanes[HIGH, i]
+        lanes[Lane.G_LOW, i], lanes[Lane.S_LOW, i] = lanes[Lane.G, i], lanes[Lane.SLOPE, i]
+        lanes[Lane.SHIFT, i] = lanes[Lane.HIGH, i]
     gauge_along(filled, parameters, lanes)
     for i in range(filled):
-        lanes[G_HIGH, i], lanes[S_HIGH, i] = lanes[G, i], lanes[SLOPE, i]
+        lanes[Lane.G_HIGH, i], lanes[Lane.S_HIGH, i] = lanes[Lane.G, i], lanes[Lane.SLOPE, i]
         # A minimum at an end closes the bracket there.
-        if lanes[S_LOW, i] >= 0.0:
-            lanes[HIGH, i] = lanes[LOW, i]
-        elif lanes[S_HIGH, i] <= 0.0:
-            lanes[LOW, i] = lanes[HIGH, i]
-        lanes[SHIFT, i] = lanes[HIGH, i]
+        if lanes[Lane.S_LOW, i] >= 0.0:
+            lanes[Lane.HIGH, i] = lanes[Lane.LOW, i]
+        elif lanes[Lane.S_HIGH, i] <= 0.0:
+            lanes[Lane.LOW, i] = lanes[Lane.HIGH, i]
+        lanes[Lane.SHIFT, i] = lanes[Lane.HIGH, i]
     for step in range(_LOWEST_STEPS):
         searching = 0
         for i in range(filled):
-            low, high, shift = lanes[LOW, i], lanes[HIGH, i], lanes[SHIFT, i]
-            g_low, g_high, s_low, s_high = lanes[G_LOW, i], lanes[G_HIGH, i], lanes[S_LOW, i], lanes[S_HIGH, i]
+            low, high, shift = lanes[Lane.LOW, i], lanes[Lane.HIGH, i], lanes[Lane.SHIFT, i]
+            g_low, g_high = lanes[Lane.G_LOW, i], lanes[Lane.G_HIGH, i]
+            s_low, s_high = lanes[Lane.S_LOW, i], lanes[Lane.S_HIGH, i]
             width = high - low
             tangents = (g_low - g_high + s_high * width) / (s_high - s_low)
             bound = g_low + s_low * tangents
@@ -247,19 +241,19 @@ def lowest(
             ahead = tangents if step % 2 == 1 else cubic
             ahead = min(max(ahead, 0.02 * width), 0.98 * width)
             settled = (low if g_low < g_high else high) if open_bracket else shift
-            lanes[SHIFT, i] = low + ahead if goes_on else settled
+            lanes[Lane.SHIFT, i] = low + ahead if goes_on else settled
             searching += goes_on
         gauge_along(filled, parameters, lanes)
         if searching == 0:
             break
         for i in range(filled):
-            shift, slope = lanes[SHIFT, i], lanes[SLOPE, i]
-            within = shift > lanes[LOW, i] and shift < lanes[HIGH, i]
+            shift, slope = lanes[Lane.SHIFT, i], lanes[Lane.SLOPE, i]
+            within = shift > lanes[Lane.LOW, i] and shift < lanes[Lane.HIGH, i]
             above = within and slope > 0.0
             below = within and slope <= 0.0
-            lanes[HIGH, i] = shift if above else lanes[HIGH, i]
-            lanes[G_HIGH, i] = lanes[G, i] if above else lanes[G_HIGH, i]
-            lanes[S_HIGH, i] = slope if above else lanes[S_HIGH, i]
-            lanes[LOW, i] = shift if below else lanes[LOW, i]
-            lanes[G_LOW, i] = lanes[G, i] if below else lanes[G_LOW, i]
-            lanes[S_LOW, i] = slope if below else lanes[S_LOW, i]
+            lanes[Lane.HIGH, i] = shift if above else lanes[Lane.HIGH, i]
+            lanes[Lane.G_HIGH, i] = lanes[Lane.G, i] if above else lanes[Lane.G_HIGH, i]
+            lanes[Lane.S_HIGH, i] = slope if above else lanes[Lane.S_HIGH, i]
+            lanes[Lane.LOW, i] = shift if below else lanes[Lane.LOW, i]
+            lanes[Lane.G_LOW, i] = lanes[Lane.G, i] if below else lanes[Lane.G_LOW, i]
+            lanes[Lane.S_LOW, i] = slope if below else lanes[Lane.S_LOW, i]

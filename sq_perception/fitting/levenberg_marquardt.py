@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.cost import DEPTH, PARAMETERS, STEP_LENGTH, Terms
+from sq_perception.fitting.cost import PARAMETERS, STEP_LENGTH, Ray, Terms
 from sq_perception.fitting.residuals import evaluate
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import inline_kernel, kernel
@@ -77,7 +77,7 @@ def minimize(
     held = np.zeros(STEP_LENGTH, dtype=np.bool_)
     next_parameters = parameters.copy()
     next_rotation = rotation.copy()
-    met = rays[:, DEPTH].copy()
+    met = rays[:, Ray.DEPTH].copy()
     cost = evaluate(stage, rays, free, terms, parameters, rotation, met, sums)
     damping = _FIRST_DAMPING
     iterations = 0

@@ -24,14 +24,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.cost import SAMPLE, WEIGHT, Rays, Terms
+from sq_perception.fitting.cost import Ray, Rays, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
-from sq_perception.fitting.priors import HullPrior
 from sq_perception.fitting.quality import UNTAPERED, Alternative, covariance_at
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
-from sq_perception.geometry.superquadric import Superquadric
 
 
 class Stage(NamedTuple):
@@ -51,8 +49,6 @@ BASIN = (Stage(SAMPSON, 300, 15, 3, 0.7), Stage(RENDERED, 300, 15, 3, 0.7))
 THING = (Stage(RENDERED, 150, 8, 4, 0.7), Stage(RENDERED, 150, 15, 3, 0.7))
 SETTLE = Stage(RENDERED, 300, 15, 3, 0.2)
 
-STEPS = 30
-"""Most steps of the last search, on all rays: beyond need."""
 FREE_SHARE = 0.25
 """Free rays per object ray: an outline has fewer pixels than an area."""
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 3e-5
@@ -88,10 +84,6 @@ class Problem:
     independent
         Number of independent rays that the object counts as, however many are drawn, where errors of neighbouring
         pixels are alike; None where every ray counts as one.
-    hull
-        A prediction of the thing's hull, which weighs in through the terms.
-    expected
-        A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
     """
 
     observation: Observation
@@ -100,19 +92,16 @@ class Problem:
     limits: tuple[np.ndarray, np.ndarray]
     deadline: float
     independent: float | None = None
-    hull: HullPrior | None = None
-    expected: Superquadric | None = None
 
     @property
     def late(self) -> bool:
         """Whether the time is up."""
         return time.perf_counter() > self.deadline
 
-    def terms_at(self, state: State) -> Terms:
-        """The terms with the predicted half sizes along the axes that a body has now."""
-        if self.expected is None:
-            return self.terms
-        return self.terms._replace(expected=self.expected.support(state.rotation.T))
+    @property
+    def has_hull(self) -> bool:
+        """Whether a predicted hull weighs in."""
+        return len(self.terms.hull_directions) > 0
 
     def with_terms(self, **changed: Any) -> Problem:
         """The problem with some terms changed."""
@@ -123,10 +112,6 @@ class Problem:
         lower, upper = (np.append(limit[:8], np.zeros(2)) for limit in self.limits)
         return replace(self, limits=(lower, upper), terms=self.terms._replace(taper_stiffness=0.0))
 
-    def without_hull(self) -> Problem:
-        """The problem as if no hull had been predicted."""
-        return replace(self, terms=self.terms._replace(hull_directions=self.terms.hull_directions[:0]), hull=None)
-
     def floor(self, count: int) -> float:
         """Cost of a body that leaves nothing but noise on ``count`` drawn rays: their total weight."""
         return float(min(count, len(self.observation.pixels))) if self.independent is None else self.independent
@@ -136,45 +121,43 @@ class Problem:
         seen = self.observation
         hits, free = seen.object_rays(count, offset), seen.free_rays(int(FREE_SHARE * count), offset)
         if self.independent is not None:
-            hits[:, WEIGHT] = self.independent / len(hits)
+            hits[:, Ray.WEIGHT] = self.independent / len(hits)
             if len(free):
-                free[:, WEIGHT] = self.independent / len(seen.pixels) * seen.free_pixels / len(free)
+                free[:, Ray.WEIGHT] = self.independent / len(seen.pixels) * seen.free_pixels / len(free)
         return Rays(hits, free)
 
     def search(self, starts: Iterable[State], stages: Sequence[Stage]) -> list[State]:
         """The bodies, best first, that go on from the last of some stages; from the first start at least."""
         states = list(starts)
         for stage in stages:
-            found = self.tried(states, stage)
+            found = self.advance(states, stage)
             states = (within_doubt(found) if self.independent is None else distinct(by_cost(found)))[: stage.kept]
         return states
 
-    def tried(self, states: Iterable[State], stage: Stage) -> list[State]:
+    def advance(self, states: Iterable[State], stage: Stage) -> list[State]:
         """Where a stage leads from each body, in their order, while there is time; from the first one at least."""
         rays = self.draw(stage.rays, stage.offset)
         found: list[State] = []
         for state in states:
-            found.append(self._minimized(stage.residual, state, rays, stage.steps, TOLERANCE))
+            found.append(self.descend(state, rays, stage.steps, residual=stage.residual))
             if self.late:
                 break
         return found
 
-    def settle(self, state: State, rays: Rays, steps: int = SETTLE.steps) -> State:
-        """A body after some steps with the rendered residual on rays at hand."""
-        return self._minimized(RENDERED, state, rays, steps, TOLERANCE)
+    def descend(
+        self, state: State, rays: Rays, steps: int = SETTLE.steps, tolerance: float = TOLERANCE,
+        residual: int = RENDERED, held: int | None = None,
+    ) -> State:
+        """A body after at most so many steps on rays at hand; its half size along an axis may be held."""
+        limits = self.limits
+        if held is not None:
+            limits = limits[0].copy(), limits[1].copy()
+            limits[0][held] = limits[1][held] = state.parameters[held]
+        return minimize(residual, *rays, self.terms, state, limits, steps, tolerance)
 
-    def held(self, state: State, axis: int, rays: Rays) -> State:
-        """A body after some steps with the rendered residual, its half size along an axis kept, within its limits."""
-        lower, upper = (limit.copy() for limit in self.limits)
-        lower[axis] = upper[axis] = min(max(state.parameters[axis], lower[axis]), upper[axis])
-        return minimize(RENDERED, *rays, self.terms_at(state), state, (lower, upper), SETTLE.steps, TOLERANCE)
-
-    def refine(self, state: State, rays: Rays, steps: int = STEPS) -> State:
-        """A body at the end of its valley."""
-        return self._minimized(RENDERED, state, rays, steps, FINAL_TOLERANCE)
-
-    def _minimized(self, residual: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
-        return minimize(residual, *rays, self.terms_at(state), state, self.limits, steps, tolerance)
+    def refine(self, state: State, rays: Rays) -> State:
+        """A body at the end of its valley, in 30 steps at most: beyond need."""
+        return self.descend(state, rays, 30, FINAL_TOLERANCE)
 
 
 _OF_A_VALLEY = ("distances", "_with_taper")
@@ -220,8 +203,7 @@ class Solution:
     @cached_property
     def distances(self) -> np.ndarray:
         """Sampson distances (n,) of a sample of the object's points to the body, metres, positive outside."""
-        rays = self.problem.observation.object_rays(SAMPLE)
-        return surface_distance(rays, self.state.parameters, self.state.rotation)
+        return surface_distance(self.problem.observation.sample, self.state.parameters, self.state.rotation)
 
     @property
     def covariance(self) -> np.ndarray:
@@ -236,10 +218,10 @@ class Solution:
 
     @cached_property
     def _with_taper(self) -> np.ndarray:
-        terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
-        return covariance_at(self.state, self.rays, terms, outline)
+        terms = self.problem.terms._replace(outline_stiffness=1 / self.problem.observation.outline)
+        return covariance_at(*self.rays, terms, self.state.parameters, self.state.rotation)
 
-    def noted(self, **changed: Any) -> Solution:
+    def annotate(self, **changed: Any) -> Solution:
         """The solution with other fields than its problem, body and rays changed: its valley is the same."""
         other = replace(self, **changed)
         other.__dict__.update({name: self.__dict__[name] for name in _OF_A_VALLEY if name in self.__dict__})

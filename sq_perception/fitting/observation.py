@@ -30,7 +30,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sq_perception.fitting.cost import drawn, through
+from sq_perception.fitting.cost import SAMPLE, draw, rays_through
 from sq_perception.fitting.options import ON_SUPPORT
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
@@ -56,8 +56,6 @@ _BEHIND_SHARE = 0.02
 """Share of a mask's pixels joined to the object by way of its support alone, from which on the mask is too large: by
 one pixel around an object of 150.  One in twenty right masks of benchmarks/household_things has as much, from its
 sensor's edges, which changes no mean; with 0.05, clean boxes in masks one pixel too large lost 3 % IoU."""
-_BACKGROUND_SHARE = 0.1
-"""Share of the pixels next to the object: if fewer were measured, there is no background within range."""
 _COARSE = 3
 """Spacing, pixels in each direction, of free pixels far from the mask."""
 _FREE_MARGIN = 3.0
@@ -66,12 +64,8 @@ _POINTS = 2000
 """Measured points of an object: enough for its moments, boxes and quantiles to settle."""
 OUTLIER_SHARE = 0.01
 """Share of the points left out at either end of a direction: readings of something else that got into the mask."""
-_NO_NOISE = 1e-6
-"""The least noise, as a share of the distance: what single precision resolves."""
 _SAMPLES = 5000
 """Third differences that are taken, about: their median is then known to 1.5 %."""
-_EDGE = 6.0
-"""Third differences of whole steps beyond so many medians, and steps, show an edge."""
 _FEWEST = 8
 """Fewest differences for an estimate: with fewer, one edge within the mask is the median."""
 
@@ -129,13 +123,13 @@ class Crop:
         distance = _mean_depth(crop, inside)
         if not math.isfinite(distance):
             return None
-        least = _NO_NOISE * max(abs(distance), 1e-3)
+        least = 1e-6 * max(abs(distance), 1e-3)  # what single precision resolves
         known = estimate_noise(crop, inside, least) if noise is None else DepthNoise(noise)
         footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
         view = camera.cropped(left, top, right - left, bottom - top)
         return cls(crop, inside, view, band, known, distance, footprint)
 
-    def observed(self, model_error: float, nan_is_empty: bool | None, plane: np.ndarray | None = None) -> Observation:
+    def observe(self, model_error: float, nan_is_empty: bool | None, plane: np.ndarray | None = None) -> Observation:
         """The crop, its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``plane`` as in the options."""
         sigma = math.hypot(self.noise.sigma, model_error)
         inside = self._coherent(_JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma, plane)
@@ -145,10 +139,11 @@ class Crop:
         if nan_is_empty is None:
             beside = cv2.subtract(near, claimed)
             measured = cv2.bitwise_and(beside, np.isfinite(self.depth).view(np.uint8))
-            nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < _BACKGROUND_SHARE
+            # Where fewer than a tenth of the pixels next to the object were measured, no background is in range.
+            nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < 0.1
         lost = regions.convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
-        shown = drawn(pixels, areas, _POINTS, 0.5)
+        shown = draw(pixels, areas, _POINTS, 0.5)
         v, u = np.divmod(shown, self.camera.width)
         return Observation(
             **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, areas=areas, free=free, free_pixels=free_pixels,
@@ -212,15 +207,20 @@ class Observation(Crop):
         """Standard deviation of an outline whose misfit was not measured yet, metres: the noise, or a whole pixel."""
         return max(self.sigma, self.footprint)
 
+    @cached_property
+    def sample(self) -> np.ndarray:
+        """Rays of the object that determine a mean, a share or a median to 1 to 3 %."""
+        return self.object_rays(SAMPLE)
+
     def object_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
-        """About ``count`` rays (k, 8) of the object, systematically by area; each weighs 1.
+        """About ``count`` rays (k, 9) of the object, systematically by area; each weighs 1.
 
         Draws with other offsets (0 to 1) take other pixels.
         """
-        return self._through(drawn(self.pixels, self.areas, count, offset), 0.0)
+        return self._through(draw(self.pixels, self.areas, count, offset), 0.0)
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
-        """At most ``count`` rays (k, 8) of free pixels, drawn evenly; z is where free space ends."""
+        """At most ``count`` rays (k, 9) of free pixels, drawn evenly; z is where free space ends."""
         pixels = self.free
         if len(pixels) > count:
             pixels = pixels[((np.arange(count) + offset) * (len(pixels) / count)).astype(np.int64)]
@@ -251,7 +251,7 @@ class Observation(Crop):
         return distance.ravel()[self.free]
 
     def _through(self, pixels: np.ndarray, margin: float) -> np.ndarray:
-        return through(pixels, self.depth, self.camera.lens, self.noise.sigma, self.model_error, margin)
+        return rays_through(pixels, self.depth, self.camera.lens, self.noise.sigma, self.model_error, margin)
 
 
 def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -346,8 +346,8 @@ def _noise(depth: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
         quantum = np.partition(moved, rank)[rank]
         steps = moved / quantum
         if np.count_nonzero(np.abs(steps - np.rint(steps)) < 0.02) > 0.8 * moved.size:
-            # The median of whole steps is a whole step.
-            near = third[third < _EDGE * max(median, quantum)]
+            # The median of whole steps is a whole step; beyond six of either is an edge.
+            near = third[third < 6.0 * max(median, quantum)]
             return math.sqrt(np.mean(near * near) / 20.0), quantum
     return MEDIAN_TO_SIGMA * median / math.sqrt(20.0), 0.0
 

@@ -40,6 +40,23 @@ def limits(points: np.ndarray, taper: float = 0.0) -> tuple[np.ndarray, np.ndarr
     return lower, upper
 
 
+def finite_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows (n, 3) of points that are finite, and which ones these are.
+
+    Raises
+    ------
+    ValueError
+        If the array is not (n, 3) or holds no finite point.
+    """
+    points = np.asarray(points, dtype=float)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
+    there = np.isfinite(points).all(axis=1)
+    if not there.any():
+        raise ValueError("no finite point: there is nothing to fit")
+    return points[there], there
+
+
 class PlaneError(ValueError):
     """A support plane that most of the object lies behind."""
 

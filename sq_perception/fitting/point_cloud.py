@@ -25,23 +25,6 @@ _BITS = 10
 """Cells of Morton's curve along an axis, as a power of 2."""
 
 
-def finite_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The rows (n, 3) of points that are finite, and which ones these are.
-
-    Raises
-    ------
-    ValueError
-        If the array is not (n, 3) or holds no finite point.
-    """
-    points = np.asarray(points, dtype=float)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
-    there = np.isfinite(points).all(axis=1)
-    if not there.any():
-        raise ValueError("no finite point: there is nothing to fit")
-    return points[there], there
-
-
 @dataclass(frozen=True, eq=False)
 class UnitCloud:
     """A cloud in its own frame: p = centre + scale axes q.

@@ -24,14 +24,14 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from sq_perception.fitting import point_cost
+from sq_perception.fitting.cost import STEP_LENGTH, Ray, Terms, rays_of
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.options import EXPONENTS, LARGEST_SIZE, MIN_PIXELS, SMALLEST_SIZE
-from sq_perception.fitting.point_cloud import UnitCloud, densest, finite_points
-from sq_perception.fitting.point_cost import BODY_LENGTH, STEP_LENGTH, Cloud, Course, Mixture, Prior
-from sq_perception.fitting.quality import carried_over, seen_extents
-from sq_perception.fitting.quality import status as assess
-from sq_perception.fitting.starts import ORDERS
-from sq_perception.geometry import rotation as quaternions
+from sq_perception.fitting.options import MIN_PIXELS, SMALLEST_SIZE, finite_points, limits
+from sq_perception.fitting.point_cloud import UnitCloud, densest
+from sq_perception.fitting.point_cost import Cloud, Course, Mixture
+from sq_perception.fitting.quality import covariance_of_form, judge, seen_extents
+from sq_perception.fitting.residuals import FOOT, evaluate
+from sq_perception.fitting.starts import ORDERS, eighth_turns, principal_axes
 from sq_perception.geometry.union import DIRECTIONS
 
 Stages: TypeAlias = tuple[tuple[int, int, int], ...]
@@ -39,30 +39,18 @@ MOST_POINTS = 2000
 """Points that are fitted of a larger cloud."""
 _STAGES, STAGES_OF_PARTS = ((200, 2, 24), (400, 6, 3)), ((400, 4, 24), (800, 8, 4))
 """Points, rounds and most bodies of each stage of the search: for one body, and for the first one of a union."""
-_OF_STARTS = 500
-"""Points that starts are made from, about."""
 _COARSE = 0.02
 """Least noise of the search, in radii of the cloud: a part that is a perfect superquadric is not the whole thing."""
-_LAST_ROUNDS = 40
-"""Most rounds with all points; mostly six do."""
-_DENSE = 0.3
-"""Share of the points that are the densest: of a cloud with 60 % of outliers seven in eight of these are none."""
-_EIGHTH_TURNS = np.stack(
-    [np.eye(3), *(quaternions.to_matrix(quaternions.from_rotation_vector(np.eye(3) * math.pi / 4)))]
-)
-_SIGMA, _SHARE = 0.05, 0.5
-"""Noise of a start, in radii of the cloud, and its share of outliers: a start is off by about so much."""
-_TAPER_PRECISION = 10.0
-"""1 / variance of a taper before its points."""
+PRIOR = Terms(huber=math.inf, volume_price=1.0, taper_stiffness=math.sqrt(10.0))
+"""What is believed of a body before its points: of two through the same ones the smaller, of little taper."""
+_MOST_TAPER = 0.9
+"""Largest taper of a body to points: those from all sides show a cone."""
 _PRIOR = np.array([1.0] * 3 + [0.5] * 2 + [1.0] * 3 + [1.0] * 3 + [0.5] * 2) ** -2.0
 """Precision of the prior of a step: what points leave open has its width."""
 _OF_MESH = 20000
 """Points that are drawn from a mesh."""
 FLAT = 1e-6
 """Spread across a plane, as a share of that along it, below which points lie on it."""
-_MANY_OUTLIERS = 0.3
-_POINTS_A_DIRECTION = 3
-"""Points a direction, of all sides: of fewer, some directions have none by chance."""
 _ONE_SIDED = 0.75
 """Share of 42 directions from the centre in which there must be points of an object that is seen from all sides."""
 
@@ -104,11 +92,11 @@ def fit_points(
     if sigma is not None and not (np.isfinite(sigma) and sigma > 0):
         raise ValueError(f"sigma: expected a positive length, got {sigma}")
     cloud = UnitCloud.of(kept, normals, MOST_POINTS)
-    reason = why_unfit(cloud)
+    reason = reason_to_fail(cloud)
     if reason:
-        return unfit(cloud, reason, began)
-    found = searched(cloud, None if sigma is None else sigma / cloud.scale, outliers, taper)
-    return assessed(cloud, found, 0, began)
+        return fail(cloud, reason, began)
+    found = search(cloud, None if sigma is None else sigma / cloud.scale, outliers, taper)
+    return assess(cloud, found, 0, began)
 
 
 def fit_mesh(mesh: Any, *, taper: bool = True) -> Fit:
@@ -117,7 +105,7 @@ def fit_mesh(mesh: Any, *, taper: bool = True) -> Fit:
     return fit_points(drawn, normals, taper=taper)
 
 
-def why_unfit(cloud: UnitCloud) -> str:
+def reason_to_fail(cloud: UnitCloud) -> str:
     """Why no body can be fitted to a cloud; empty if one can."""
     if len(cloud.points) < MIN_PIXELS:
         return f"{len(cloud.points)} points; a fit needs {MIN_PIXELS}"
@@ -129,14 +117,9 @@ def why_unfit(cloud: UnitCloud) -> str:
     return ""
 
 
-def prior_of(cloud: UnitCloud, taper: bool) -> Prior:
-    """What is believed of a body before the points of this cloud."""
-    extent, most = cloud.extent, 0.9 if taper else 0.0
-    middle = (cloud.points.max(axis=0) + cloud.points.min(axis=0)) / 2
-    least, largest = SMALLEST_SIZE * extent, LARGEST_SIZE * extent
-    lower = np.array([*[least] * 3, *[EXPONENTS[0]] * 2, *(middle - 2 * extent), -most, -most])
-    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(middle + 2 * extent), most, most])
-    return Prior(lower, upper, _TAPER_PRECISION, 0.5)
+def limits_of(cloud: UnitCloud, taper: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Limits (10,) of a body of this cloud."""
+    return limits(cloud.points, _MOST_TAPER if taper else 0.0)
 
 
 def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -176,29 +159,29 @@ def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarra
     return kept, np.where(is_known, normals, 0.0)[there]
 
 
-def searched(
+def search(
     cloud: UnitCloud, sigma: float | None, outliers: float | str, taper: bool, stages: Stages = _STAGES
 ) -> Mixture:
     """The likeliest body of a cloud, tapered if it is likelier so than two more numbers cost."""
-    share = _SHARE if outliers == "auto" else float(outliers)
-    found = [Mixture(body[None], turn[None], _SIGMA, share, -math.inf) for body, turn in _starts(cloud)]
-    straight, tapered = prior_of(cloud, False), prior_of(cloud, True)
+    share = 0.5 if outliers == "auto" else float(outliers)
+    found = [Mixture(body[None], turn[None], 0.05, share, -math.inf) for body, turn in _starts(cloud)]
+    straight, tapered = limits_of(cloud, False), limits_of(cloud, True)
     for number, rounds, most in stages:
         some = cloud.surface(number)
         course = Course(False, outliers != "auto", _COARSE, rounds, 1e-3, False)
-        found = [point_cost.settle(some, each, straight, course) for each in found[:most]]
+        found = [point_cost.maximize(some, each, PRIOR, straight, course) for each in found[:most]]
         found.sort(key=lambda each: -each.likelihood)
     candidates = [(found[0], straight)]
     if taper:
-        turned = [point_cost.settle(some, each, tapered, course) for each in _in_all_orders(found[0])]
+        turned = [point_cost.maximize(some, each, PRIOR, tapered, course) for each in _in_all_orders(found[0])]
         best = max(turned, key=lambda each: each.likelihood)
         if best.likelihood > found[0].likelihood + math.log(len(some.points)):
             candidates.append((best, tapered))
     whole = cloud.surface()
-    course = Course(sigma is not None, outliers != "auto", 1e-4, _LAST_ROUNDS, 1e-5, True)
+    course = Course(sigma is not None, outliers != "auto", 1e-4, 40, 1e-5, True)  # mostly six rounds do
     if sigma is not None:
-        candidates = [(each._replace(sigma=sigma), prior) for each, prior in candidates]
-    ends = [point_cost.settle(whole, each, prior, course) for each, prior in candidates]
+        candidates = [(each._replace(sigma=sigma), bounds) for each, bounds in candidates]
+    ends = [point_cost.maximize(whole, each, PRIOR, bounds, course) for each, bounds in candidates]
     return ends[-1] if ends[-1].likelihood > ends[0].likelihood + math.log(len(whole.points)) else ends[0]
 
 
@@ -218,11 +201,11 @@ def _starts(cloud: UnitCloud) -> list[tuple[np.ndarray, np.ndarray]]:
     They are those of all points and those of the densest: outliers are spread through a volume, and so are sparse.
     """
     found = []
-    few = cloud.surface(_OF_STARTS).points
-    for some in (few, densest(few, _DENSE)):
-        principal = np.linalg.eigh(np.cov(some.T))[1]
-        principal *= math.copysign(1.0, float(np.linalg.det(principal)))
-        for turn in principal @ _EIGHTH_TURNS:
+    few = cloud.surface(500).points
+    # Of a cloud with 60 % of outliers seven in eight of the densest 30 % are none.
+    for some in (few, densest(few, 0.3)):
+        principal = principal_axes(np.cov(some.T))
+        for turn in (principal, *eighth_turns(principal)):
             low, high = np.sort(some @ turn, axis=0)[[len(some) // 20, -1 - len(some) // 20]]
             half = np.maximum((high - low) / 2, SMALLEST_SIZE * cloud.extent)
             for order in ORDERS:
@@ -231,7 +214,7 @@ def _starts(cloud: UnitCloud) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
-def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: tuple[str, ...] = ()) -> Fit:
+def assess(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: tuple[str, ...] = ()) -> Fit:
     """The result of the k-th body of a mixture."""
     surface = cloud.surface()
     probability, distance, _ = point_cost.shares(surface, mixture, np.zeros((len(cloud.points), len(mixture.bodies))))
@@ -244,16 +227,16 @@ def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: 
     covariance = units[:, None] * (world @ covariance[:11, :11] @ world.T) * units
     fitted = cloud.body(body, turn)
     canonical = fitted.canonical_form()
-    covariance = carried_over(covariance, fitted, canonical)
+    covariance = covariance_of_form(covariance, fitted, canonical)
     sigma = mixture.sigma * cloud.scale
     inlying = weight > 0.5
     own = cloud.points[inlying] @ cloud.axes.T * cloud.scale + cloud.centre
     typical = float(np.median(np.abs(off[inlying]))) * cloud.scale if inlying.any() else math.inf
-    status, message = assess(canonical, covariance, typical, sigma, False)
+    status, message = judge(canonical, covariance, typical, sigma, False)
     notes = list(reasons)
     if len(mixture.bodies) == 1 and _covered(cloud.points[inlying], body, turn) < _ONE_SIDED:
         notes.append("seen from one side only: sq-perception recover knows more, with the camera that took the points")
-    if len(mixture.bodies) == 1 and mixture.share > _MANY_OUTLIERS:
+    if len(mixture.bodies) == 1 and mixture.share > 0.3:
         notes.append(f"{mixture.share:.0%} of the points are on no surface of it: outliers, or parts of more bodies")
     if float(canonical.size.min()) < 2 * sigma:
         notes.append("it is no thicker than the noise: the points lie on one plane, as far as they tell")
@@ -273,7 +256,8 @@ def assessed(cloud: UnitCloud, mixture: Mixture, k: int, began: float, reasons: 
 def _covered(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> float:
     """Share of the 42 directions from a body's centre in which there is one of some points (n, 3)."""
     cells = _directions(some, body, turn)
-    return len(np.unique(cells)) / min(len(DIRECTIONS), max(1, len(cells) // _POINTS_A_DIRECTION))
+    # Of fewer than three points a direction some have none by chance.
+    return len(np.unique(cells)) / min(len(DIRECTIONS), max(1, len(cells) // 3))
 
 
 def _directions(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> np.ndarray:
@@ -284,14 +268,12 @@ def _directions(some: np.ndarray, body: np.ndarray, turn: np.ndarray) -> np.ndar
 def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) -> np.ndarray:
     """Covariance (13, 13) of sizes, exponents, centre, rotation vector and tapers, in units of the cloud."""
     body, turn = mixture.bodies[k], mixture.turns[k]
-    none = Prior(np.full(BODY_LENGTH, -np.inf), np.full(BODY_LENGTH, np.inf), 0.0, 0.0)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     residual = point_cost.distances(surface.points, body, turn) / mixture.sigma
     known = weight * np.maximum(1.0 - (1.0 - weight) * residual**2, 0.0)  # less what the mixture hides
-    scaled = known / mixture.sigma**2
-    point_cost.normal_equations(
-        surface.points, np.zeros(len(weight)), np.zeros(len(weight)), scaled, body, turn, none, sums
-    )
+    rays = rays_of(surface.points)
+    rays[:, Ray.WEIGHT] = known / mixture.sigma**2
+    evaluate(FOOT, rays, rays[:0], Terms(huber=math.inf), body, turn, rays[:, Ray.DEPTH].copy(), sums)
     cell = _directions(surface.points, body, turn)
     number = np.bincount(cell, weight, len(DIRECTIONS))
     together = np.bincount(cell, weight * residual, len(DIRECTIONS)) ** 2 / np.maximum(number, 1.0)
@@ -305,7 +287,7 @@ def covariance_of(surface: Cloud, weight: np.ndarray, mixture: Mixture, k: int) 
     return np.asarray((covariance + covariance.T) / 2)
 
 
-def unfit(cloud: UnitCloud, reason: str, began: float, **more: Any) -> Fit:
+def fail(cloud: UnitCloud, reason: str, began: float, **more: Any) -> Fit:
     """The result where no body can be fitted: a box about the points."""
     half = np.maximum(np.ptp(cloud.points, axis=0) / 2, 0.01 * max(cloud.extent, 1e-6))
     middle = (cloud.points.max(axis=0) + cloud.points.min(axis=0)) / 2

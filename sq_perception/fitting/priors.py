@@ -1,14 +1,14 @@
 """What is known of a body beyond its image: a support plane, and how bodies mostly are; compiled.
 
-plane       (lowest point above the plane) / sigma where negative: n.t + d - h(-R^T n), h the support function.
-gap         as ``plane`` where positive, another sigma, Cauchy: bodies do not hover, unless they stand on other things.
+plane       how deep a body reaches below the plane, over sigma: h(-R^T n) - n.t - d, h the support function.
+gap         how far it ends above the plane, over sigma, Cauchy: bodies do not hover, unless they stand on others.
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
 roundness   log(a1 / a2) and 1 - e2, over sigma, both together bivariate Cauchy: most bodies are of revolution about z,
             and those that are not are so by any amount.
 hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions against a predicted one b, whitened by
-            W^T W, the inverse of its covariance (:meth:`~sq_perception.fitting.priors.HullPrior.root`).
+            W^T W, the inverse of its covariance (:attr:`~sq_perception.fitting.priors.HullPrior.root`).
 taper       k_x and k_y over their standard deviation: most things do not taper.
 volume      a linear price on log(a1 a2 a3), which prefers the smaller of two bodies that explain the image alike.
 
@@ -38,11 +38,8 @@ import numpy as np
 
 from sq_perception.fitting.cost import STEP_LENGTH, Terms, add_block, add_row
 from sq_perception.fitting.intersection import form_of
-from sq_perception.geometry.kernels import kernel, profile_sines, support_at, support_derivatives
+from sq_perception.geometry.kernels import kernel, profile_sines, support_at
 
-PULL_SHARE = 0.07
-"""Standard deviation, as a share of the thing's extent, of the pull on a body that misfits twice as much as the best
-do.  On 408 things of benchmarks/household_things, seeds from 5000, 0.05 to 0.14 change IoU by less than 0.2 %."""
 MODEL_SHARE = 0.02
 """Difference between a thing's support function and that of the nearest superquadric, as a share of the thing's extent.
 Chosen on benchmarks/household_things, where 0.01 and 0.03 cost 0.2 % of IoU."""
@@ -72,34 +69,21 @@ class HullPrior:
     extent: float
     freedom: float = math.inf
 
-    def root(self, misfit: float = 1.0) -> np.ndarray:
-        """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions).
-
-        ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits.
-
-        The most probable body is not the one nearest to the prediction.  A superquadric that fits has the thing's form,
-        and S tells how probable each form is.  One that does not fit is a compromise: b is the best that is known of
-        the thing's form, and the body is to be near to it in each direction, however uncertain.  Growth in all
-        directions is left to S, as the outline determines a thing's size.
-        """
-        count = len(self.support)
-        pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
-        precision = self._precision + pull * (np.eye(count) - 1.0 / count)
-        return np.ascontiguousarray(np.linalg.cholesky(precision).T)
-
     @cached_property
-    def _precision(self) -> np.ndarray:
-        """(S + model error)^-1."""
-        model = MODEL_SHARE * self.extent
-        return np.linalg.inv(self.covariance + model**2 * np.eye(len(self.support)))
+    def root(self) -> np.ndarray:
+        """W (J, J) with W^T W = (S + model error)^-1."""
+        model = (MODEL_SHARE * self.extent) ** 2 * np.eye(len(self.support))
+        return np.ascontiguousarray(np.linalg.cholesky(np.linalg.inv(self.covariance + model)).T)
 
 
 @kernel
 def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """Cost of all terms together."""
     cost = 0.0
-    if terms.plane_stiffness > 0.0 or terms.rest_stiffness > 0.0:
-        cost += _support_cost(terms, parameters, rotation, sums)
+    if terms.plane_stiffness > 0.0:
+        cost += _plane_cost(terms, parameters, rotation, sums)
+    if terms.rest_stiffness > 0.0:
+        cost += _rest_cost(terms, rotation, sums)
     if terms.proportion_stiffness > 0.0:
         cost += _proportion_cost(terms, parameters, sums)
     if terms.expectation_stiffness > 0.0:
@@ -122,61 +106,40 @@ def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
 
 
 @kernel
-def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
-    a1, a2, a3, e1, e2, k1, k2 = form_of(parameters)
-    t1, t2, t3 = parameters[5], parameters[6], parameters[7]
-    normal = terms.plane[:3]
-    n = np.zeros(3)
-    for k in range(3):
-        n[k] = rotation[0, k] * normal[0] + rotation[1, k] * normal[1] + rotation[2, k] * normal[2]
-    cost = 0.0
+def _plane_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+    down = np.empty((1, 3))
+    down[0] = -terms.plane[:3]
+    rows = _support_rows(down, terms.plane[3:], parameters, rotation)
+    below = rows[STEP_LENGTH, 0]
+    s = terms.plane_stiffness if below > 0.0 else terms.gap_stiffness
+    square = s * s * below * below
+    cost = square if below > 0.0 else math.log1p(square)
+    rows *= s if below > 0.0 else s / math.sqrt(1.0 + square)
+    add_block(rows, 1, sums)
+    return cost
+
+
+@kernel
+def _rest_cost(terms: Terms, rotation: np.ndarray, sums: np.ndarray) -> float:
+    n = terms.plane[:3] @ rotation
+    upright = np.argmax(np.abs(n))
+    s = terms.rest_stiffness
+    square = (n @ n - n[upright] * n[upright]) * s * s
     row = np.zeros(STEP_LENGTH + 1)
-    h, hx, hy, hz, h1, h2, hk1, hk2 = support_derivatives(-n[0], -n[1], -n[2], a1, a2, a3, e1, e2, k1, k2)
-    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + terms.plane[3] - h
-    s = terms.plane_stiffness if lowest < 0.0 else terms.gap_stiffness
-    if s > 0.0:
-        residual = s * lowest
-        if lowest < 0.0:
-            cost += residual * residual
-        else:
-            square = residual * residual
-            cost += math.log1p(square)
-            s /= math.sqrt(1.0 + square)
-            residual /= math.sqrt(1.0 + square)
-        row[0], row[1], row[2] = s * hx * n[0], s * hy * n[1], s * hz * n[2]
-        row[3], row[4], row[11], row[12] = -s * h1, -s * h2, -s * hk1, -s * hk2
-        row[5], row[6], row[7] = s * normal[0], s * normal[1], s * normal[2]
-        row[8] = s * (hy * n[2] - hz * n[1])
-        row[9] = s * (hz * n[0] - hx * n[2])
-        row[10] = s * (hx * n[1] - hy * n[0])
-        row[STEP_LENGTH] = residual
-        add_row(row, sums)
-    if terms.rest_stiffness > 0.0:
-        s = terms.rest_stiffness
-        upright = 0
-        for k in range(1, 3):
-            if abs(n[k]) > abs(n[upright]):
-                upright = k
-        square = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2] - n[upright] * n[upright]) * s * s
-        cost += math.log1p(square)
-        scale = s / math.sqrt(1.0 + square)
-        for k in range(3):
-            if k == upright:
-                continue
+    for k in range(3):
+        if k != upright:
             row[:] = 0.0
             after, before = (k + 1) % 3, (k + 2) % 3
-            row[8 + before] = scale * n[after]
-            row[8 + after] = -scale * n[before]
-            row[STEP_LENGTH] = scale * n[k]
-            add_row(row, sums)
-    return cost
+            row[8 + before], row[8 + after], row[STEP_LENGTH] = n[after], -n[before], n[k]
+            add_row(row * s / math.sqrt(1.0 + square), sums)
+    return math.log1p(square)
 
 
 @kernel
 def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """Cost |W (h - b)|^2 of the hull."""
     count = terms.hull_directions.shape[0]
-    rows = _hull_rows(terms, parameters, rotation)
+    rows = _support_rows(terms.hull_directions, terms.hull_support, parameters, rotation)
     whitened = rows @ terms.hull_root.T
     square = 0.0
     for j in range(count):
@@ -188,17 +151,19 @@ def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: 
 @kernel
 def hull_distances(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Differences h - b (J,) of the support functions, metres."""
-    return _hull_rows(terms, parameters, rotation)[STEP_LENGTH]
+    return _support_rows(terms.hull_directions, terms.hull_support, parameters, rotation)[STEP_LENGTH]
 
 
 @kernel
-def _hull_rows(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def _support_rows(
+    directions: np.ndarray, support: np.ndarray, parameters: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
     """Derivatives of h, a column for each direction, and h - b in the last row: one array, for vector code."""
-    count = terms.hull_directions.shape[0]
+    count = directions.shape[0]
     rows = np.empty((STEP_LENGTH + 1, count))
     for j in range(count):
-        rows[5, j], rows[6, j], rows[7, j] = terms.hull_directions[j]
-        rows[STEP_LENGTH, j] = -terms.hull_support[j]
+        rows[5, j], rows[6, j], rows[7, j] = directions[j]
+        rows[STEP_LENGTH, j] = -support[j]
     a1, a2, a3, e1, e2, k1, k2 = form_of(parameters)
     t1, t2, t3 = parameters[5], parameters[6], parameters[7]
     m11, m12, m13 = rotation[0]

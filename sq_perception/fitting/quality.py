@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.cost import DEPTH, SAMPLE, STEP_LENGTH, WEIGHT, Rays, Terms
+from sq_perception.fitting.cost import SAMPLE, STEP_LENGTH, Ray, Terms
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
@@ -58,31 +58,24 @@ _UNFINISHED = "how far it is off is not known"
 _AXES = "xyz"
 
 
-def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.ndarray:
+@kernel
+def covariance_at(
+    hits: np.ndarray, free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
     """Covariance (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
 
-    (13, 13), of the tapers too, where the terms let bodies taper.
-    ``outline`` is the standard deviation of the outline, metres.
+    (13, 13), of the tapers too, where the terms let bodies taper.  Of many rays some count for all.
     """
-    stride = max(1, len(rays.hits) // SAMPLE)
-    terms = terms._replace(outline_stiffness=1 / outline)
-    return np.asarray(_covariance(rays.hits, rays.free, stride, terms, state.parameters, state.rotation))
-
-
-@kernel
-def _covariance(
-    hits: np.ndarray, free: np.ndarray, stride: int, terms: Terms, parameters: np.ndarray, rotation: np.ndarray
-) -> np.ndarray:
-    """Covariance (k, k) as by :func:`covariance_at`; each ``stride``-th ray counts for those between."""
+    stride = max(1, hits.shape[0] // SAMPLE)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     of_hull = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     hits, free = hits[::stride].copy(), free[::stride].copy()
-    hits[:, WEIGHT] *= stride
-    free[:, WEIGHT] *= stride
-    cost = evaluate(RENDERED, hits, free, terms, parameters, rotation, hits[:, DEPTH].copy(), sums)
+    hits[:, Ray.WEIGHT] *= stride
+    free[:, Ray.WEIGHT] *= stride
+    cost = evaluate(RENDERED, hits, free, terms, parameters, rotation, hits[:, Ray.DEPTH].copy(), sums)
     has_hull = terms.hull_directions.shape[0] > 0
     hull = hull_cost(terms, parameters, rotation, of_hull) if has_hull else 0.0
-    variance = max(1.0, (cost - hull) / hits[:, WEIGHT].sum())
+    variance = max(1.0, (cost - hull) / hits[:, Ray.WEIGHT].sum())
     vaguer = 1.0 + hull / terms.hull_freedom
     unknowns = UNTAPERED if terms.taper_stiffness == 0.0 else STEP_LENGTH
     prior = np.zeros(unknowns)  # that of the taper is among the terms
@@ -163,7 +156,7 @@ def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
     return moments
 
 
-def carried_over(covariance: np.ndarray, body: Superquadric, form: Superquadric) -> np.ndarray:
+def covariance_of_form(covariance: np.ndarray, body: Superquadric, form: Superquadric) -> np.ndarray:
     """The covariance in another of the body's 8 forms: axes exchange and reverse."""
     turn = np.round(body.rotation_matrix.T @ form.rotation_matrix)
     change = np.eye(UNTAPERED)
@@ -180,12 +173,12 @@ def undetermined(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
 # The result
 
 
-def assessed(solution: Solution, began: float) -> Fit:
+def assess(solution: Solution, began: float) -> Fit:
     """The result of a fit, with its residual, inliers, covariance and status."""
     observation, state = solution.problem.observation, solution.state
     body = state.body
     canonical = body.canonical_form()
-    covariance = carried_over(solution.covariance + spread(state, solution.alternatives), body, canonical)
+    covariance = covariance_of_form(solution.covariance + spread(state, solution.alternatives), body, canonical)
     sigma_taper = np.sqrt(np.diag(solution.taper_covariance))
     if solution.is_unfinished:  # it holds at the lowest point of a valley, where the body is not
         covariance = np.full_like(covariance, np.nan)
@@ -194,7 +187,7 @@ def assessed(solution: Solution, began: float) -> Fit:
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         typical = quantile(np.maximum(solution.distances, 0.0), _REACHED)
-    reached, message = status(canonical, covariance, typical, observation.sigma, solution.as_hull)
+    reached, message = judge(canonical, covariance, typical, observation.sigma, solution.as_hull)
     if solution.is_unfinished and reached == Status.CONVERGED:
         reached, message = Status.WEAK, _UNFINISHED
     cut = (CUT_SHORT,) if solution.problem.late else ()
@@ -210,7 +203,7 @@ def assessed(solution: Solution, began: float) -> Fit:
         sigma_taper=sigma_taper[::-1] if body.size[0] < body.size[1] else sigma_taper,  # x and y are exchanged
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
-        is_predicted=solution.problem.hull is not None,
+        is_predicted=solution.problem.has_hull,
         as_hull=solution.as_hull,
     )
 
@@ -237,7 +230,7 @@ def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
     return np.clip(seen / (2 * half * (1 - 2 * OUTLIER_SHARE)), 0.0, 1.0)
 
 
-def failed(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
+def fail(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
     """The result where no body can be fitted: a box around what was seen."""
     points = observation.points
     distance = np.abs(body.sampson_distance(points))
@@ -247,7 +240,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
     )
 
 
-def status(
+def judge(
     body: Superquadric, covariance: np.ndarray, typical: float, sigma: float, as_hull: bool
 ) -> tuple[Status, str]:
     """The status and its reason, without lengths: only the reader of the image knows their unit.

@@ -15,6 +15,8 @@ A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; :mod:`sq_perception.fitti
 
 classic     sqrt(a1 a2 a3) (g^2 - 1) / sigma at the measured point: Solina and Bajcsy's, as g^2 = F^e1.
 Sampson     (g - 1) / (|grad g| sigma) at the measured point: first order distance; wide basin of attraction.
+foot        the same of points without a camera, less the distance to expect, 0 on the right side of the surface; it
+            changes with the body as the surface does at the point's foot, where the derivatives are taken.
 rendered    (z_hit - z) c / sigma, where the ray meets the body at z_hit: the exact statement of a depth image.
             dz_hit = -dg / (grad g . d).  c = cos / sqrt(cos^2 + kappa), with cos the incidence, tames grazing rays.
 covered     (min g - 1) / (|grad g| sigma_o) instead, where the ray of an object pixel misses the body; sigma_o is that
@@ -35,30 +37,11 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.cost import LANES, STEP_LENGTH, STIFFNESS, Terms, add_block, cauchy_loss, huber_loss
+from sq_perception.fitting.cost import LANES, STEP_LENGTH, Ray, Terms, add_block, cauchy_loss, huber_loss
 from sq_perception.fitting.intersection import (
-    EX,
-    EY,
-    EZ,
-    G1,
-    G2,
-    GK1,
-    GK2,
-    GX,
-    GY,
-    GZ,
     LOWEST_TOLERANCE,
-    MEASURED,
-    PRECISION,
-    QX,
-    QY,
-    QZ,
     ROWS,
-    SHARE,
-    SHIFT,
-    SLOPE,
-    START,
-    G,
+    Lane,
     enter,
     gauge_along,
     lowest,
@@ -69,7 +52,7 @@ from sq_perception.fitting.intersection import (
 from sq_perception.fitting.priors import prior_cost
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
-CLASSIC, SAMPSON, RENDERED = 0, 1, 2
+CLASSIC, SAMPSON, RENDERED, FOOT = range(4)
 
 _TINY = 1e-12
 """Number added to a squared gradient of the gauge, 1 / metres^2, to keep divisions by it finite."""
@@ -100,7 +83,10 @@ def evaluate(
             meet(filled, terms.hit_tolerance, parameters, lanes, missed, again)
             cost += _rendered_rows(filled, before, terms, lanes, missed, block)
         else:
-            gauge_along(filled, parameters, lanes)
+            if stage == FOOT:
+                to_foot(filled, parameters, lanes)
+            else:
+                gauge_along(filled, parameters, lanes)
             cost += _measured_rows(filled, stage, terms, parameters, lanes, block)
         _differentiate(filled, rotation, lanes, block)
         if stage == CLASSIC:
@@ -137,26 +123,26 @@ def _rendered_rows(
     """Cost of rendered and covered residuals; writes their scale and value to the block's first and last row."""
     cost = 0.0
     for i in range(filled):
-        gx, gy, gz, along = lanes[GX, i], lanes[GY, i], lanes[GZ, i], lanes[SLOPE, i]
-        ex, ey, ez = lanes[EX, i], lanes[EY, i], lanes[EZ, i]
+        gx, gy, gz, along = lanes[Lane.GX, i], lanes[Lane.GY, i], lanes[Lane.GZ, i], lanes[Lane.SLOPE, i]
+        ex, ey, ez = lanes[Lane.EX, i], lanes[Lane.EY, i], lanes[Lane.EZ, i]
         square = gx * gx + gy * gy + gz * gz + _TINY
-        over = lanes[G, i] - 1.0
+        over = lanes[Lane.G, i] - 1.0
         across = terms.grazing * square * (ex * ex + ey * ey + ez * ez)
         covered = terms.outline_stiffness / math.sqrt(square)
-        factor = covered if missed[i] else lanes[PRECISION, i] / math.sqrt(along * along + across)
-        short = lanes[MEASURED, i] - lanes[START, i] - lanes[SHIFT, i]
+        factor = covered if missed[i] else lanes[Lane.PRECISION, i] / math.sqrt(along * along + across)
+        short = lanes[Lane.MEASURED, i] - lanes[Lane.START, i] - lanes[Lane.SHIFT, i]
         residual = over * covered if missed[i] else (short * along + over) * factor
         if terms.dead_zone > 0.0 and not missed[i]:
             excess = max(abs(residual) - terms.dead_zone, 0.0)
             factor = factor if excess > 0.0 else 0.0
             residual = math.copysign(excess, residual)
-        loss, scale = _loss(residual, terms.outline_huber if missed[i] else terms.huber, terms, lanes[SHARE, i])
+        loss, scale = _loss(residual, terms.outline_huber if missed[i] else terms.huber, terms, lanes[Lane.SHARE, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
     for i in range(met.shape[0]):
-        reached = lanes[START, i] + lanes[SHIFT, i] - (lanes[G, i] - 1.0) / lanes[SLOPE, i]
-        met[i] = lanes[MEASURED, i] if missed[i] else reached
+        reached = lanes[Lane.START, i] + lanes[Lane.SHIFT, i] - (lanes[Lane.G, i] - 1.0) / lanes[Lane.SLOPE, i]
+        met[i] = lanes[Lane.MEASURED, i] if missed[i] else reached
     return cost
 
 
@@ -164,16 +150,20 @@ def _rendered_rows(
 def _measured_rows(
     filled: int, stage: int, terms: Terms, parameters: np.ndarray, lanes: np.ndarray, block: np.ndarray
 ) -> float:
-    """Cost of classic or Sampson residuals at the measured points; writes to the block as :func:`_rendered_rows`."""
+    """Cost of residuals at the measured points; writes to the block as :func:`_rendered_rows`."""
     root_of_volume = math.sqrt(parameters[0] * parameters[1] * parameters[2])
     cost = 0.0
     for i in range(filled):
-        gx, gy, gz, g = lanes[GX, i], lanes[GY, i], lanes[GZ, i], lanes[G, i]
-        sampson = lanes[PRECISION, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
-        classic = (g + 1.0) * root_of_volume * lanes[PRECISION, i]
-        residual = (g - 1.0) * (classic if stage == CLASSIC else sampson)
-        factor = 2.0 * g * root_of_volume * lanes[PRECISION, i] if stage == CLASSIC else sampson
-        loss, scale = _loss(residual, terms.huber, terms, lanes[SHARE, i])
+        gx, gy, gz, g = lanes[Lane.GX, i], lanes[Lane.GY, i], lanes[Lane.GZ, i], lanes[Lane.G, i]
+        stiffness = lanes[Lane.PRECISION, i]
+        first_order = stiffness / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+        factor = 2.0 * g * root_of_volume * stiffness if stage == CLASSIC else first_order
+        residual = (g - 1.0) * ((g + 1.0) * root_of_volume * stiffness if stage == CLASSIC else first_order)
+        share = lanes[Lane.SHARE, i]
+        if stage == FOOT:
+            residual = (lanes[Lane.START, i] - lanes[Lane.EXPECTED, i]) * stiffness
+            share = 0.0 if lanes[Lane.ONE_SIDED, i] * residual > 0.0 else share
+        loss, scale = _loss(residual, terms.huber, terms, share)
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
@@ -187,20 +177,20 @@ def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: 
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
     for i in range(filled):
-        scale, shift = block[0, i], lanes[SHIFT, i]
-        x = lanes[QX, i] + shift * lanes[EX, i]
-        y = lanes[QY, i] + shift * lanes[EY, i]
-        z = lanes[QZ, i] + shift * lanes[EZ, i]
-        gx, gy, gz = scale * lanes[GX, i], scale * lanes[GY, i], scale * lanes[GZ, i]
+        scale, shift = block[0, i], lanes[Lane.SHIFT, i]
+        x = lanes[Lane.QX, i] + shift * lanes[Lane.EX, i]
+        y = lanes[Lane.QY, i] + shift * lanes[Lane.EY, i]
+        z = lanes[Lane.QZ, i] + shift * lanes[Lane.EZ, i]
+        gx, gy, gz = scale * lanes[Lane.GX, i], scale * lanes[Lane.GY, i], scale * lanes[Lane.GZ, i]
         block[0, i], block[1, i], block[2, i] = -x * gx, -y * gy, -z * gz
-        block[3, i], block[4, i] = scale * lanes[G1, i], scale * lanes[G2, i]
+        block[3, i], block[4, i] = scale * lanes[Lane.G1, i], scale * lanes[Lane.G2, i]
         block[5, i] = -(m11 * gx + m12 * gy + m13 * gz)
         block[6, i] = -(m21 * gx + m22 * gy + m23 * gz)
         block[7, i] = -(m31 * gx + m32 * gy + m33 * gz)
         block[8, i] = gy * z - gz * y
         block[9, i] = gz * x - gx * z
         block[10, i] = gx * y - gy * x
-        block[11, i], block[12, i] = scale * lanes[GK1, i], scale * lanes[GK2, i]
+        block[11, i], block[12, i] = scale * lanes[Lane.GK1, i], scale * lanes[Lane.GK2, i]
 
 
 @kernel
@@ -212,10 +202,10 @@ def _free_rows(
     lowest(filled, 1.0, LOWEST_TOLERANCE, parameters, lanes, missed)
     cost = 0.0
     for i in range(filled):
-        gx, gy, gz = lanes[GX, i], lanes[GY, i], lanes[GZ, i]
-        factor = -terms.outline_stiffness * lanes[PRECISION, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
-        residual = 0.0 if missed[i] else max(0.0, (lanes[G, i] - 1.0) * factor)
-        loss, scale = huber_loss(residual, terms.outline_huber, lanes[SHARE, i])
+        gx, gy, gz = lanes[Lane.GX, i], lanes[Lane.GY, i], lanes[Lane.GZ, i]
+        factor = -terms.outline_stiffness * lanes[Lane.PRECISION, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+        residual = 0.0 if missed[i] else max(0.0, (lanes[Lane.G, i] - 1.0) * factor)
+        loss, scale = huber_loss(residual, terms.outline_huber, lanes[Lane.SHARE, i])
         cost += loss
         block[0, i] = scale * factor if residual > 0.0 else 0.0
         block[STEP_LENGTH, i] = scale * residual
@@ -223,6 +213,27 @@ def _free_rows(
         _differentiate(filled, rotation, lanes, block)
         add_block(block, filled, sums)
     return cost
+
+
+@inline_kernel
+def sampson(lanes: np.ndarray, i: int) -> float:
+    """Sampson distance to the surface at a lane's q + shift e, metres, positive outside."""
+    gx, gy, gz = lanes[Lane.GX, i], lanes[Lane.GY, i], lanes[Lane.GZ, i]
+    return (lanes[Lane.G, i] - 1.0) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+
+
+@kernel
+def to_foot(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
+    """Write the Sampson distance of each point to START and carry it to the surface, with the gauge there."""
+    gauge_along(filled, parameters, lanes)
+    for i in range(filled):
+        gx, gy, gz = lanes[Lane.GX, i], lanes[Lane.GY, i], lanes[Lane.GZ, i]
+        lanes[Lane.START, i] = sampson(lanes, i)
+        back = lanes[Lane.START, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+        lanes[Lane.QX, i] -= back * gx
+        lanes[Lane.QY, i] -= back * gy
+        lanes[Lane.QZ, i] -= back * gz
+    gauge_along(filled, parameters, lanes)
 
 
 @kernel
@@ -235,8 +246,7 @@ def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndar
         place(part, distance[:0], parameters, rotation, lanes)
         gauge_along(padded(part.shape[0], lanes), parameters, lanes)
         for i in range(part.shape[0]):
-            gx, gy, gz = lanes[GX, i], lanes[GY, i], lanes[GZ, i]
-            distance[begin + i] = (lanes[G, i] - 1.0) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+            distance[begin + i] = sampson(lanes, i)
     return distance
 
 
@@ -246,7 +256,7 @@ def mean_loss(rays: np.ndarray, huber: float, parameters: np.ndarray, rotation: 
     distance = surface_distance(rays, parameters, rotation)
     total = 0.0
     for i in range(rays.shape[0]):
-        loss, _ = huber_loss(distance[i] * rays[i, STIFFNESS], huber, 1.0)
+        loss, _ = huber_loss(distance[i] * rays[i, Ray.STIFFNESS], huber, 1.0)
         total += loss
     return total / rays.shape[0]
 
@@ -266,8 +276,6 @@ def penetration(free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation
         if filled == LANES or (n == free.shape[0] and filled > 0):
             lowest(padded(filled, lanes), 1.0, LOWEST_TOLERANCE, parameters, lanes, missed)
             for i in range(filled):
-                gx, gy, gz = lanes[GX, i], lanes[GY, i], lanes[GZ, i]
-                inside = (1.0 - lanes[G, i]) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
-                depth[owner[i]] = 0.0 if missed[i] else max(inside, 0.0)
+                depth[owner[i]] = 0.0 if missed[i] else max(-sampson(lanes, i), 0.0)
             filled = 0
     return depth

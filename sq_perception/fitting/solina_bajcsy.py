@@ -27,21 +27,16 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting.cost import DEPTH, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT, Terms
+from sq_perception.fitting.cost import Ray, Terms, rays_of
 from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.options import MIN_PIXELS, limits
+from sq_perception.fitting.options import finite_points, limits
 from sq_perception.fitting.residuals import CLASSIC
-from sq_perception.fitting.starts import on_one_line
+from sq_perception.fitting.starts import reason_to_fail
 from sq_perception.geometry import rotation as quaternions
 
-_NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))
-_UNIT = 0.01
-"""Unit of residuals, as a share of the extent to the power 3/2, which makes the damping independent of units."""
 _MOST_POINTS = 1000
 """Most points that are fitted.  Chosen: the cost of the method grows with their number, its result hardly changes."""
-_MOST_STEPS, _TOLERANCE = 100, 1e-6
-"""Most steps of Levenberg-Marquardt, and the gain, as a share of the cost, that ends it.  Chosen: beyond need."""
 _ESCAPE = 0.3
 """Standard deviation of a disturbance: of log sizes, exponents, angles, and of the centre in mean half sizes."""
 
@@ -70,33 +65,22 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
         If the array is not (n, 3) or holds no finite point.
     """
     began = time.perf_counter()
-    points = np.asarray(points, dtype=float)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: expected shape (n, 3), got {points.shape}")
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        raise ValueError("no finite point: there is nothing to fit")
+    points, _ = finite_points(points)
     if len(points) > _MOST_POINTS:
         points = points[np.linspace(0, len(points) - 1, _MOST_POINTS).astype(int)]
-    start = moment_start(points)
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    reason = ""
-    if len(points) < MIN_PIXELS:
-        reason = f"{len(points)} points; a fit needs {MIN_PIXELS}"
-    elif on_one_line(points):
-        reason = "the points lie on one line"
-    state = start
+    reason = reason_to_fail(points, len(points), "points")
+    state = moment_start(points)
     if not reason:
-        rays = np.zeros((len(points), RAY_COLUMNS))
-        rays[:, ORIGIN_X], rays[:, ORIGIN_Y], rays[:, DEPTH] = points.T
-        rays[:, STIFFNESS], rays[:, WEIGHT] = 1 / (_UNIT * extent**1.5), 1.0
-        bounds, terms = limits(points), Terms(huber=math.inf)
-        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, bounds, _MOST_STEPS, _TOLERANCE)
-        rng = np.random.default_rng(0)
+        extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+        rays, bounds = rays_of(points), limits(points)
+        rays[:, Ray.STIFFNESS] = 1 / (0.01 * extent**1.5)  # makes the damping independent of units
+
+        def minimum(start: State) -> State:
+            return minimize(CLASSIC, rays, rays[:0], Terms(huber=math.inf), start, bounds, 100, 1e-6)  # beyond need
+
+        state, rng = minimum(state), np.random.default_rng(0)
         for _ in range(escapes):
-            other = _disturbed(state, rng)
-            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, other, bounds, _MOST_STEPS, _TOLERANCE)
-            state = min(state, other, key=lambda each: each.cost)
+            state = min(state, minimum(_disturb(state, rng)), key=lambda each: each.cost)
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))
     residual = float(np.sqrt(np.mean(distance**2)))
@@ -110,7 +94,7 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
     )
 
 
-def _disturbed(state: State, rng: np.random.Generator) -> State:
+def _disturb(state: State, rng: np.random.Generator) -> State:
     """The body with its size, shape, centre and rotation disturbed at random."""
     parameters = state.parameters.copy()
     parameters[0:3] *= np.exp(_ESCAPE * rng.standard_normal(3))

@@ -31,6 +31,7 @@ import numpy as np
 from sq_perception.fitting.cost import PARAMETERS
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation, span
+from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
@@ -42,11 +43,8 @@ _BOX_EXPONENT = 0.3
 MOMENT_SHARE = 0.27
 START_EXPONENT = 0.5
 """Moment over squared half size, and exponents, of a start: between ellipsoid (0.2, 1) and box (1/3, 0)."""
-_RANK = 4
-"""Pairs of the largest mean depths that are passed over for the centre's depth, in case of a stray pixel."""
-_MOST_PAIRS = 2500
-"""Pairs that are taken, about: enough for second moments to 2 %."""
-_EIGHTH_TURN = math.pi / 4
+EIGHTH_TURNS = quaternions.to_matrix(quaternions.from_rotation_vector(np.eye(3) * math.pi / 4))
+"""Rotations (3, 3, 3) by 45 degrees about each axis."""
 _EXPONENTS = (0.3, 0.8)
 """Exponents of the last group: between box and ellipsoid, nearer to either."""
 ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
@@ -63,10 +61,12 @@ def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
     return Superquadric(size, np.array([0.2, 0.2]), centre + axes @ ((low + high) / 2), quaternions.from_matrix(axes))
 
 
-def on_one_line(points: np.ndarray) -> bool:
-    """Whether points (n >= 1, 3) spread along one direction only."""
+def reason_to_fail(points: np.ndarray, count: int, of: str) -> str:
+    """Why no body can be fitted to points (n >= 1, 3), ``count`` ``of`` what was measured; empty if one can."""
+    if count < MIN_PIXELS:
+        return f"{count} {of}; a fit needs {MIN_PIXELS}"
     spread = np.linalg.eigvalsh(_scatter(points))
-    return bool(spread[1] <= 1e-6 * spread[2])
+    return "the measured points lie on one line" if spread[1] <= 1e-6 * spread[2] else ""
 
 
 def principal(points: np.ndarray) -> list[State]:
@@ -142,11 +142,13 @@ def groups(observation: Observation) -> Iterator[list[State]]:
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
     """Centre (3,) and second moments (3, 3) about it of the completed body; None if no pixel has an opposite."""
     camera = observation.camera
-    stride = max(1, round(math.sqrt(len(observation.pixels) / _MOST_PAIRS)))
+    # Some 2500 pairs give second moments to 2 %.
+    stride = max(1, round(math.sqrt(len(observation.pixels) / 2500)))
     u, v, pairs = _opposite_pairs(observation.depth, observation.mask, camera.lens, stride)
     if len(pairs) < 3:
         return None
-    rank = len(pairs) - 1 - min(max(_RANK // stride**2, int(0.002 * len(pairs))), len(pairs) - 1)
+    # The centre's depth is the largest mean depth of a pair, but for some in case of stray pixels.
+    rank = len(pairs) - 1 - min(max(4 // stride**2, int(0.002 * len(pairs))), len(pairs) - 1)
     depth = float(np.partition(pairs[:, 5], rank)[rank])
     centre = camera.unproject(np.array(u), np.array(v), np.array(depth))
     return centre, _moments(pairs, centre, observation.footprint / 2)
@@ -209,16 +211,9 @@ def _opposite_pairs(
     return centre_u, centre_v, pairs[:k]
 
 
-def eighth_turns(axes: np.ndarray) -> list[np.ndarray]:
+def eighth_turns(axes: np.ndarray) -> np.ndarray:
     """The axes turned by 45 degrees about each of themselves: where two moments are alike, their axes are arbitrary."""
-    turned = []
-    for k in range(3):
-        turn = np.eye(3)
-        i, j = (k + 1) % 3, (k + 2) % 3
-        c, s = math.cos(_EIGHTH_TURN), math.sin(_EIGHTH_TURN)
-        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
-        turned.append(axes @ turn)
-    return turned
+    return np.asarray(axes @ EIGHTH_TURNS)
 
 
 def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = START_EXPONENT) -> list[State]:
@@ -269,11 +264,11 @@ def other_axes(state: State) -> list[State]:
     return found
 
 
-def resized(state: State, axis: int, size: float) -> State:
-    """The body with another half size along one of its axes; the face towards the camera stays in place."""
+def resized(state: State, axis: int, size: float, end: float = 0.0) -> State:
+    """The body with another half size along one of its axes: that ``end``, 1 or -1, moves; 0: the hidden one."""
     parameters = state.parameters.copy()
     direction = state.rotation[:, axis]
-    away = 1.0 if direction @ parameters[5:8] > 0 else -1.0
+    away = end or math.copysign(1.0, direction @ parameters[5:8])
     parameters[5:8] += away * (size - parameters[axis]) * direction
     parameters[axis] = size
     return State(parameters, state.rotation, math.inf, state.iterations)

@@ -37,9 +37,9 @@ from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import Problem, Solution
 from sq_perception.fitting.observation import Crop, Observation
-from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions, check_plane
+from sq_perception.fitting.options import MODEL_ERROR, FitOptions, check_plane
 from sq_perception.fitting.priors import HullPrior
-from sq_perception.fitting.quality import WEAK_SHARE, Alternative, assessed, failed
+from sq_perception.fitting.quality import WEAK_SHARE, Alternative, assess, fail
 from sq_perception.geometry.quantiles import deviation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS
@@ -104,20 +104,20 @@ def fit(
     """
     began = time.perf_counter()
     options = options or FitOptions()
-    depth, mask = _checked_images(depth, mask, camera)
-    later = cache(lambda: _checked_starts(start())) if callable(start) else None
-    given = [] if callable(start) else _checked_starts(start)
+    depth, mask = _check_images(depth, mask, camera)
+    later = cache(lambda: _read_starts(start())) if callable(start) else None
+    given = [] if callable(start) else _read_starts(start)
     crop = Crop.around(depth, mask, camera, options.noise)
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     fills_image = fills(box(mask), np.isfinite(depth) & (depth > 0))
     task = _Task(crop, fills_image, options, given, later, began)
-    solution = _solved(task)
+    solution = _solve(task)
     if solution is None:
-        observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
+        observation = crop.observe(options.model_error or 0.0, options.nan_is_empty, options.plane)
         body = starts.enclosing_box(observation.points, observation.footprint)
-        return failed(body, observation, _hopeless(observation), began)
-    return assessed(solution, began)
+        return fail(body, observation, _why_not(observation), began)
+    return assess(solution, began)
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,51 +153,51 @@ class _Task:
 
     def problem(self, model_error: float) -> Problem | None:
         """The problem of an object that strays so far; None if no body can be fitted to it."""
-        observation = self.crop.observed(model_error, self.options.nan_is_empty, self.options.plane)
-        if _hopeless(observation):
+        observation = self.crop.observe(model_error, self.options.nan_is_empty, self.options.plane)
+        if _why_not(observation):
             return None
         check_plane(observation.points, self.options.plane)
         return course.problem_of(observation, self.options, self.began + self.options.time_budget)
 
 
-def _solved(task: _Task) -> Solution | None:
+def _solve(task: _Task) -> Solution | None:
     """The solution by the model that the image prefers, see the module; None if no body can be fitted to it."""
     given = task.options.model_error
     if given is not None:
-        return _as_thing(task, given, task.starts()) if given else _exactly(task, [])
+        return _fit_thing(task, given, task.starts()) if given else _fit_superquadric(task, [])
     if task.is_thing():
-        thing = _as_thing(task, task.model_error, task.starts())
+        thing = _fit_thing(task, task.model_error, task.starts())
         if thing is None or thing.problem.late or not (task.is_fine or _is_explained(thing, task.crop.noise.sigma)):
             return thing
-        exactly = _exactly(task, [thing.state], patient=False)
+        exactly = _fit_superquadric(task, [thing.state], patient=False)
         if exactly is None or exactly.misfit >= _NOISE_ALONE or exactly.unsure().max() > WEAK_SHARE:
             return thing
         more = (*exactly.alternatives, Alternative(thing.state, _AS_A_THING))
-        return exactly.noted(alternatives=more, spread_factor=course.SPREAD)
-    exactly = _exactly(task, [])
+        return exactly.annotate(alternatives=more, spread_factor=course.SPREAD)
+    exactly = _fit_superquadric(task, [])
     if exactly is None or exactly.problem.late:
         return exactly
     may_stray = task.crop.camera.is_pinhole and not task.is_fine and not task.fills_image
     if exactly.misfit < (_NOISE_ALONE if may_stray else course.EXPLAINS):
-        return exactly.noted(spread_factor=course.SPREAD) if may_stray else exactly
+        return exactly.annotate(spread_factor=course.SPREAD) if may_stray else exactly
     left = deviation(np.abs(exactly.distances))
-    return _as_thing(task, task.model_error if may_stray else left, [exactly.state, *task.starts()])
+    return _fit_thing(task, task.model_error if may_stray else left, [exactly.state, *task.starts()])
 
 
-def _as_thing(task: _Task, model_error: float, starts_: list[State]) -> Solution | None:
+def _fit_thing(task: _Task, model_error: float, starts_: list[State]) -> Solution | None:
     """The most probable body of a thing, from given bodies and boxes."""
     problem = task.problem(model_error)
     if problem is None:
         return None
     points, plane = problem.observation.points, task.options.plane
     boxes = starts.principal(points) if plane is None else starts.on_plane(points, plane)
-    solution = course.thing(problem, [*starts_, *boxes])
-    if problem.hull is None and not problem.late:
-        solution = valleys.or_oval(valleys.weighed(solution))
-    return solution if problem.late else valleys.with_open_ends(solution)
+    solution = course.fit_thing(problem, [*starts_, *boxes])
+    if not solution.problem.has_hull and not problem.late:
+        solution = valleys.add_oval(valleys.weigh_open_sizes(solution))
+    return solution if problem.late else valleys.lengthen_open_ends(solution)
 
 
-def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution | None:
+def _fit_superquadric(task: _Task, first: list[State], patient: bool = True) -> Solution | None:
     """The best superquadric; if not ``patient``, None where its cheapest starts explain the image not."""
     problem = task.problem(0.0)
     if problem is None:
@@ -210,14 +210,14 @@ def _exactly(task: _Task, first: list[State], patient: bool = True) -> Solution 
         groups.append(task.later)
     if patient:
         groups += [lambda: next(symmetric, [])] * 4
-    solution = course.exact(problem, groups, patient)
+    solution = course.fit_superquadric(problem, groups, patient)
     if solution is None:
         return None
-    for step in (valleys.explored, valleys.along_view, valleys.with_open_ends, valleys.weighed):
+    for step in (valleys.explore, valleys.weigh_depths, valleys.lengthen_open_ends, valleys.weigh_open_sizes):
         if solution.problem.late or solution.misfit > course.EXPLAINS:
             break
         solution = step(solution)
-    return solution.noted(is_unfinished=solution.problem.late and solution.misfit > _UNFINISHED)
+    return solution.annotate(is_unfinished=solution.problem.late and solution.misfit > _UNFINISHED)
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:
@@ -242,14 +242,14 @@ def warm_up() -> None:
         fit(depth, mask, camera, start=body)
 
 
-def _checked_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def _check_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     depth, mask = camera.readings(depth), np.asarray(mask)
     if mask.shape != depth.shape or mask.dtype != bool:
         raise ValueError(f"mask: expected a bool image of shape {depth.shape}, got {mask.dtype} {mask.shape}")
     return depth, mask
 
 
-def _checked_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadric]) -> list[State]:
+def _read_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadric]) -> list[State]:
     if isinstance(start, str) and start == "auto":
         return []
     is_one = isinstance(start, Superquadric) and not start.batch_shape
@@ -262,9 +262,5 @@ def _checked_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadri
     return states
 
 
-def _hopeless(observation: Observation) -> str:
-    """Why no body can be fitted to these pixels; empty if one can."""
-    count = len(observation.pixels)
-    if count < MIN_PIXELS:
-        return f"{count} pixels with a depth; a fit needs {MIN_PIXELS}"
-    return "the measured points lie on one line" if starts.on_one_line(observation.points) else ""
+def _why_not(observation: Observation) -> str:
+    return starts.reason_to_fail(observation.points, len(observation.pixels), "pixels with a depth")

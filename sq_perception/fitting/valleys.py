@@ -20,19 +20,22 @@ the covariance.  Of the last, other sizes are tried, the one of a predicted body
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sq_perception.fitting import starts
-from sq_perception.fitting.cost import DEPTH, Rays
+from sq_perception.fitting.cost import Ray, Rays
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import SETTLE, SIGNIFICANT, SLACK, Problem, Solution, alike, by_cost
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.quality import Alternative, undetermined
 from sq_perception.fitting.starts import resized
+from sq_perception.imaging import regions
 
 _SETTLED, _UNSURE = 1.03, 0.01
 """Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
@@ -68,7 +71,7 @@ _EXPECTATION_SIGMA = 0.25
 """Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
 
 
-def explored(solution: Solution) -> Solution:
+def explore(solution: Solution) -> Solution:
     """The solution of an exact superquadric after a search of other valleys, of which noise and a poor view may hide a
     deeper one.
 
@@ -86,7 +89,7 @@ def explored(solution: Solution) -> Solution:
         rivals = starts.other_depths(best, int(np.argmax(unsure)))
         if unexplained:
             rivals += starts.other_axes(best)
-        refined = _refined(solution, rivals)
+        refined = _refine(solution, rivals)
         found += refined
         better = by_cost(refined)[0] if refined else best
         if better.cost >= best.cost - SIGNIFICANT:
@@ -98,21 +101,21 @@ def explored(solution: Solution) -> Solution:
         return solution
     weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
     more = (Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))
-    return solution.noted(alternatives=(*solution.alternatives, *more))
+    return solution.annotate(alternatives=(*solution.alternatives, *more))
 
 
-def _refined(solution: Solution, rivals: list[State]) -> list[State]:
+def _refine(solution: Solution, rivals: list[State]) -> list[State]:
     """Rivals on all rays: those that hold on few, one a valley, and not in that of the body at hand."""
     problem, best = solution.problem, solution.state
     few = problem.draw(SETTLE.rays, SETTLE.offset)
-    reference = problem.settle(best, few)
+    reference = problem.descend(best, few)
     hopeless, chosen = _HOPELESS * reference.cost, [best._replace(cost=reference.cost)]
     # On other rays the body may already find its way out of a shallow valley.
     settled = [reference]
     for rival in rivals:
-        state = problem.settle(rival, few, _FIRST_STEPS)
+        state = problem.descend(rival, few, _FIRST_STEPS)
         if state.cost < hopeless:
-            settled.append(problem.settle(state, few, SETTLE.steps - _FIRST_STEPS))
+            settled.append(problem.descend(state, few, SETTLE.steps - _FIRST_STEPS))
         if problem.late:
             break
     for state in by_cost(settled):
@@ -124,24 +127,23 @@ def _refined(solution: Solution, rivals: list[State]) -> list[State]:
 # Open half sizes
 
 
-def along_view(solution: Solution) -> Solution:
+def weigh_depths(solution: Solution) -> Solution:
     """The solution with all half sizes along the view that the image allows, where readings are rounded."""
     quantum = solution.problem.observation.noise.quantum
-    if quantum > 0 and faces_camera(solution.rays.hits, quantum):
-        best, allowed = plausible(solution)
-        solution = replace(solution, state=best)
-        if allowed:
-            solution = solution.noted(alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
-    return solution
+    if not (quantum > 0 and faces_camera(solution.rays.hits, quantum)):
+        return solution
+    best, allowed = plausible_depths(solution)
+    solution = replace(solution, state=best)
+    return solution.annotate(alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2) if allowed else solution
 
 
-def weighed(solution: Solution) -> Solution:
+def weigh_open_sizes(solution: Solution) -> Solution:
     """The solution, or a better one once half sizes that the image leaves open are left to priors and a prediction.
 
     Of a thing each competes with bodies of which that size is like the other two, or thin.
     """
     problem, state, rays, expected = solution.problem, solution.state, solution.rays, solution.problem.options.expected
-    if problem.hull is not None or (expected is None and problem.independent is None):
+    if problem.has_hull or (expected is None and problem.independent is None):
         return solution
     weak = [int(k) for k in np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))]
     if not weak:
@@ -153,35 +155,29 @@ def weighed(solution: Solution) -> Solution:
             rivals += [resized(state, k, share * typical) for share in (1.0, _THIN)]
     if expected is not None:
         prior = expected() if callable(expected) else expected
-        problem = replace(problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA), expected=prior)
         extents = prior.support(state.rotation.T)
+        problem = problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA, expected=extents)
         rivals += [resized(state, k, float(extents[k])) for k in weak]
         notes = (*notes, "half sizes weighed against a prediction")
     few = problem.draw(SETTLE.rays, SETTLE.offset)
-    few = few.weighing(rays.weight / few.weight)
-    settled = by_cost(problem.settle(rival, few) for rival in rivals)
+    few = few.scale(rays.weight / few.weight)
+    settled = by_cost(problem.descend(rival, few) for rival in rivals)
     return replace(solution, problem=problem, state=problem.refine(settled[0], rays), notes=notes)
 
 
-def or_oval(solution: Solution) -> Solution:
+def add_oval(solution: Solution) -> Solution:
     """The solution of a thing, with the body that the image prefers without regard to roundness as another one."""
     problem, rays = solution.problem, solution.rays
     free = problem.with_terms(roundness_stiffness=0.0)
     oval = replace(solution, problem=free, state=free.refine(solution.state, rays))
-    dearer = problem.settle(oval.state, rays, 0).cost - problem.settle(solution.state, rays, 0).cost
+    dearer = problem.descend(oval.state, rays, 0).cost - problem.descend(solution.state, rays, 0).cost
     share = _OVAL / (_OVAL + (1 - _OVAL) * math.exp(0.5 * max(dearer, 0.0)))
-    return solution.noted(alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
-
-
-def _rounded(problem: Problem) -> Problem:
-    """The problem with residuals that count only beyond half a step."""
-    observation = problem.observation
-    return problem.with_terms(dead_zone=_DEAD_ZONE * observation.noise.quantum / observation.sigma)
+    return solution.annotate(alternatives=(*solution.alternatives, Alternative(oval.state, share, oval.covariance)))
 
 
 def faces_camera(hits: np.ndarray, quantum: float) -> bool:
     """Whether many rays (n, 7) read the same depth."""
-    depth = hits[:, DEPTH]
+    depth = hits[:, Ray.DEPTH]
     level = np.rint((depth - depth.min()) / quantum).astype(np.int64)
     return bool(np.bincount(level).max() > _FACE_SHARE * len(hits))
 
@@ -191,106 +187,93 @@ def _view_axis(state: State) -> int:
     return int(np.argmax(np.abs(state.rotation[2])))
 
 
-def plausible(solution: Solution) -> tuple[State, list[Alternative]]:
+def plausible_depths(solution: Solution) -> tuple[State, list[Alternative]]:
     """The best body, and those that the rounded readings allow, none if no other than the given one.
 
     The best is the given one, which averages roundings out, as long as the readings hardly leave a size open, else the
     mean of all.
     """
-    best, rays = solution.state, solution.rays
-    rays = rays.every(max(1, len(rays.hits) // _RAYS))
-    walk = _Walk(_rounded(solution.problem), rays)
-    walk.along_view(best)
-    if walk.least < _ALLOWED and walk.deviation() < _CERTAIN:
+    best, observation = solution.state, solution.problem.observation
+    rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
+    problem = solution.problem.with_terms(dead_zone=_DEAD_ZONE * observation.noise.quantum / observation.sigma)
+    walk = _walk(problem, rays, best, math.inf)
+    if min(each.state.cost for each in walk) < _ALLOWED and _weigh(walk)[1] < _CERTAIN:
         return best, []
-    start = walk.states[walk.sizes.index(math.log(best.parameters[_view_axis(best)]))]
+    start = next(each.state for each in walk if each.log_size == math.log(best.parameters[_view_axis(best)]))
     for rival in starts.other_orders(best):
-        walk.along_view(rival)
-    if walk.deviation() < _OPEN and start.cost < walk.least + _ALLOWED:
-        return best, walk.alternatives()
-    return walk.mean(), walk.alternatives()
+        walk += _walk(problem, rays, rival, min(each.state.cost for each in walk))
+    mean, deviation, weights = _weigh(walk)
+    others = [Alternative(each.state, float(weight)) for each, weight in zip(walk, weights, strict=True)]
+    if deviation < _OPEN and start.cost < min(each.state.cost for each in walk) + _ALLOWED:
+        return best, others
+    near = sorted(walk, key=lambda each: abs(each.log_size - mean))[:3]
+    return _hold(problem, rays, min(near, key=lambda each: each.state.cost).state, mean), others
 
 
-class _Walk:
-    """Bodies held at one half size along the view after another, from starts outwards, and their weights."""
+class _Held(NamedTuple):
+    """A body of a given half size along the view, and the width of the sizes that it stands for."""
 
-    def __init__(self, problem: Problem, rays: Rays) -> None:
-        self.problem, self.rays = problem, rays
-        self.states: list[State] = []
-        self.sizes: list[float] = []
-        self.paces: list[float] = []
-        self.least = math.inf
-
-    def along_view(self, start: State) -> None:
-        """Walk from one start, up and down, until the readings forbid to go on."""
-        axis = _view_axis(start)
-        log_size = math.log(start.parameters[axis])
-        here = self._held(start, log_size)
-        found = {log_size: here}
-        self.least = min(self.least, here.cost)
-        for direction in (1, -1):
-            state, position, unlikely = here, log_size, 0
-            for pace in _PACES:
-                position += direction * math.log(pace)
-                state = found[position] = self._held(state, position)
-                self.least = min(self.least, state.cost)
-                unlikely = unlikely + 1 if state.cost > self.least + _UNLIKELY else 0
-                if unlikely == 2 and self.least < _ALLOWED:
-                    break
-        sizes = sorted(found)
-        self.sizes += sizes
-        self.states += [found[x] for x in sizes]
-        self.paces += np.gradient(sizes).tolist()
-
-    def weights(self) -> np.ndarray:
-        """Weights (n,) of the bodies for a uniform density of the log size; they sum to 1."""
-        cost = np.array([state.cost for state in self.states])
-        weights = np.exp(-0.5 * (cost - self.least)) * np.array(self.paces)
-        return np.asarray(weights / weights.sum())
-
-    def deviation(self) -> float:
-        """Standard deviation of the log size."""
-        weights, sizes = self.weights(), np.array(self.sizes)
-        return math.sqrt(weights @ (sizes - weights @ sizes) ** 2)
-
-    def mean(self) -> State:
-        """The body of the mean log size, fitted from the likeliest one near it."""
-        weights, sizes = self.weights(), np.array(self.sizes)
-        mean = float(weights @ sizes)
-        near = np.argsort(np.abs(sizes - mean))[:3]
-        nearest = min((self.states[k] for k in near), key=lambda state: state.cost)
-        return self._held(nearest, mean)
-
-    def alternatives(self) -> list[Alternative]:
-        return [Alternative(state, float(w)) for state, w in zip(self.states, self.weights(), strict=True)]
-
-    def _held(self, start: State, log_size: float) -> State:
-        axis = _view_axis(start)
-        lower, upper = self.problem.limits
-        size = min(max(math.exp(log_size), lower[axis]), upper[axis])
-        return self.problem.held(resized(start, axis, size), axis, self.rays)
+    log_size: float
+    pace: float
+    state: State
 
 
-def with_open_ends(solution: Solution) -> Solution:
+def _walk(problem: Problem, rays: Rays, start: State, least: float) -> list[_Held]:
+    """Bodies of one size after another, from a start up and down, until the readings forbid to go on.
+
+    ``least`` is the least cost of any body so far.
+    """
+    first = math.log(start.parameters[_view_axis(start)])
+    found = {first: _hold(problem, rays, start, first)}
+    least = min(least, found[first].cost)
+    for direction in (1, -1):
+        state, log_size, unlikely = found[first], first, 0
+        for pace in _PACES:
+            log_size += direction * math.log(pace)
+            state = found[log_size] = _hold(problem, rays, state, log_size)
+            least = min(least, state.cost)
+            unlikely = unlikely + 1 if state.cost > least + _UNLIKELY else 0
+            if unlikely == 2 and least < _ALLOWED:
+                break
+    sizes = sorted(found)
+    return [_Held(size, pace, found[size]) for size, pace in zip(sizes, np.gradient(sizes), strict=True)]
+
+
+def _hold(problem: Problem, rays: Rays, start: State, log_size: float) -> State:
+    axis = _view_axis(start)
+    size = min(max(math.exp(log_size), problem.limits[0][axis]), problem.limits[1][axis])
+    return problem.descend(resized(start, axis, size), rays, held=axis)
+
+
+def _weigh(walk: list[_Held]) -> tuple[float, float, np.ndarray]:
+    """Mean and standard deviation of the log size, uniform before the image, and the weights (n,) of the bodies."""
+    sizes, paces, cost = np.array([(each.log_size, each.pace, each.state.cost) for each in walk]).T
+    weights = np.exp(-0.5 * (cost - cost.min())) * paces
+    weights /= weights.sum()
+    mean = weights @ sizes
+    return float(mean), math.sqrt(weights @ (sizes - mean) ** 2), weights
+
+
+def lengthen_open_ends(solution: Solution) -> Solution:
     """The solution, with longer bodies as alternatives where the image's border hides how long it is."""
     problem, state = solution.problem, solution.state
     ends = list(_hidden_ends(problem.observation, state))
     if not ends:
         return solution
-    problem = problem.without_hull()
+    problem = problem.with_terms(hull_directions=problem.terms.hull_directions[:0])
     rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
-    most = problem.settle(state, rays, 0).cost + _NO_EVIDENCE
+    most = problem.descend(state, rays, 0).cost + _NO_EVIDENCE
     found = []
     for axis, sign in ends:
         for factor in _LONGER:
             longer = min(factor * state.parameters[axis], problem.limits[1][axis])
-            other = problem.held(_longer(state, axis, sign, longer), axis, rays)
+            other = problem.descend(resized(state, axis, longer, sign), rays, held=axis)
             if other.cost < most:
                 found.append(other)
         if problem.late:
             break
     others = tuple(Alternative(other, 1 / (1 + len(found))) for other in found)
-    return solution.noted(alternatives=(*solution.alternatives, *others))
+    return solution.annotate(alternatives=(*solution.alternatives, *others))
 
 
 def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:
@@ -298,36 +281,12 @@ def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, 
 
     They end at the image's border, or at a band without readings along it: of a rectified image, of a stereo camera.
     """
-    known = np.isfinite(observation.depth)
+    known, mask, camera = np.isfinite(observation.depth), observation.mask, observation.camera
     known.flat[observation.free] = True  # some are known to be empty without a reading
-    (left, right), (top, bottom) = _ends(known), _ends(known.T)
-    rows, columns = np.flatnonzero(right >= 0), np.flatnonzero(bottom >= 0)
-    firsts, lasts = (rows, left[rows]), (rows, right[rows])
-    sides = [firsts, (top[columns], columns), lasts, (bottom[columns], columns)]
-    cut = np.array([observation.mask[side].any() for side in sides])
-    if not cut.any():
-        return
-    camera = observation.camera
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            u, v = camera.project(state.parameters[5:8] + sign * state.parameters[axis] * state.rotation[:, axis])
-            if not np.isfinite([u, v]).all():
-                continue
-            row, column = (int(np.clip(np.rint(at), 0, n - 1)) for at, n in ((v, camera.height), (u, camera.width)))
-            if (cut & [u < left[row], v < top[column], u > right[row], v > bottom[column]]).any():
-                yield axis, sign
-
-
-def _ends(known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first and the last set pixel of each row (h,); beyond either border where none is."""
-    any_, width = known.any(axis=1), known.shape[1]
-    last = width - 1 - known[:, ::-1].argmax(axis=1)
-    return np.where(any_, known.argmax(axis=1), width), np.where(any_, last, -1)
-
-
-def _longer(state: State, axis: int, sign: float, size: float) -> State:
-    """The body with one end farther out and the other one in place."""
-    parameters = state.parameters.copy()
-    parameters[5:8] += sign * (size - parameters[axis]) * state.rotation[:, axis]
-    parameters[axis] = size
-    return state._replace(parameters=parameters)
+    left, top, width, height = regions.box(known)
+    right, bottom = left + width - 1, top + height - 1
+    cut = np.array([mask[:, left].any(), mask[top].any(), mask[:, right].any(), mask[bottom].any()])
+    for axis, sign in itertools.product(range(3), (1.0, -1.0)) if cut.any() else ():
+        u, v = camera.project(state.parameters[5:8] + sign * state.parameters[axis] * state.rotation[:, axis])
+        if (cut & [u < left, v < top, u > right, v > bottom]).any():
+            yield axis, sign

@@ -10,24 +10,13 @@ import pytest
 import residual_statement as statement
 import torch
 
-from sq_perception.fitting.cost import (
-    DEPTH,
-    DIRECTION_X,
-    DIRECTION_Y,
-    ORIGIN_X,
-    ORIGIN_Y,
-    RAY_COLUMNS,
-    STEP_LENGTH,
-    STIFFNESS,
-    WEIGHT,
-    Terms,
-)
+from sq_perception.fitting.cost import STEP_LENGTH, Ray, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.residuals import CLASSIC, RENDERED, SAMPSON, evaluate, penetration, surface_distance
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
-NO_RAYS = np.empty((0, RAY_COLUMNS))
+NO_RAYS = np.empty((0, len(Ray)))
 PLAIN = Terms(huber=np.inf, outline_huber=np.inf)
 SIGMA = 0.003
 
@@ -41,20 +30,20 @@ def random_body(
 
 
 def rays_to(points: np.ndarray, pinhole: bool) -> np.ndarray:
-    rays = np.zeros((len(points), RAY_COLUMNS))
+    rays = np.zeros((len(points), len(Ray)))
     if pinhole:
-        rays[:, [DIRECTION_X, DIRECTION_Y]] = points[:, :2] / points[:, 2:]
+        rays[:, [Ray.DIRECTION_X, Ray.DIRECTION_Y]] = points[:, :2] / points[:, 2:]
     else:
-        rays[:, [ORIGIN_X, ORIGIN_Y]] = points[:, :2]
-    rays[:, DEPTH] = points[:, 2]
-    rays[:, STIFFNESS], rays[:, WEIGHT] = 1 / SIGMA, 1.0
+        rays[:, [Ray.ORIGIN_X, Ray.ORIGIN_Y]] = points[:, :2]
+    rays[:, Ray.DEPTH] = points[:, 2]
+    rays[:, Ray.STIFFNESS], rays[:, Ray.WEIGHT] = 1 / SIGMA, 1.0
     return rays
 
 
 def torch_rays(rays: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     origin, direction = np.zeros((len(rays), 3)), np.ones((len(rays), 3))
-    origin[:, :2], direction[:, :2] = rays[:, [ORIGIN_X, ORIGIN_Y]], rays[:, [DIRECTION_X, DIRECTION_Y]]
-    return torch.tensor(origin), torch.tensor(direction), torch.tensor(rays[:, DEPTH])
+    origin[:, :2], direction[:, :2] = rays[:, [Ray.ORIGIN_X, Ray.ORIGIN_Y]], rays[:, [Ray.DIRECTION_X, Ray.DIRECTION_Y]]
+    return torch.tensor(origin), torch.tensor(direction), torch.tensor(rays[:, Ray.DEPTH])
 
 
 def as_torch(body: Superquadric) -> Superquadric:
@@ -81,7 +70,7 @@ def assert_same(
 ) -> None:
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     state = State.of(body)
-    cost = evaluate(stage, rays, free, terms, state.parameters, state.rotation, rays[:, DEPTH].copy(), sums)
+    cost = evaluate(stage, rays, free, terms, state.parameters, state.rotation, rays[:, Ray.DEPTH].copy(), sums)
     value, matrix = expected
     assert cost == pytest.approx(value, rel=tolerance, abs=1e-12)
     lower = np.tril(np.ones((STEP_LENGTH, STEP_LENGTH), bool))
@@ -133,7 +122,7 @@ def test_rendered_depth_and_derivatives(
 ) -> None:
     body = random_body(rng, shape, taper)
     rays = rays_to(visible_points(body, rng, pinhole), pinhole)
-    rays[:, DEPTH] += rng.normal(0, 0.003, len(rays))
+    rays[:, Ray.DEPTH] += rng.normal(0, 0.003, len(rays))
     origin, direction, depth = torch_rays(rays)
     expected = expected_sums(
         body, lambda moved: statement.rendered(moved, origin, direction, depth, PLAIN.grazing) / SIGMA
@@ -147,8 +136,8 @@ def test_free_space_and_derivatives(pinhole: bool, taper: tuple[float, float], r
     body = random_body(rng, taper=taper)
     around = body.translation + rng.uniform(-0.12, 0.12, (400, 3))
     free = rays_to(around, pinhole)
-    free[:, DEPTH] = np.where(rng.random(400) < 0.5, 1e300, around[:, 2])
-    free[:, STIFFNESS] = 1.0
+    free[:, Ray.DEPTH] = np.where(rng.random(400) < 0.5, 1e300, around[:, 2])
+    free[:, Ray.STIFFNESS] = 1.0
     origin, direction, limit = torch_rays(free)
     terms = PLAIN._replace(outline_stiffness=1 / SIGMA, pinhole=float(pinhole))
     expected = expected_sums(body, lambda moved: torch.relu(statement.outline(moved, origin, direction, limit)) / SIGMA)
@@ -168,7 +157,7 @@ def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random
     terms = PLAIN._replace(outline_stiffness=1 / SIGMA)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     state = State.of(body)
-    cost = evaluate(RENDERED, rays, NO_RAYS, terms, state.parameters, state.rotation, rays[:, DEPTH].copy(), sums)
+    cost = evaluate(RENDERED, rays, NO_RAYS, terms, state.parameters, state.rotation, rays[:, Ray.DEPTH].copy(), sums)
     assert cost > 0
     assert np.isfinite(cost)
     gradient = sums[STEP_LENGTH, :STEP_LENGTH]
@@ -235,7 +224,8 @@ def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
     residual = 0.01 / SIGMA
     for huber, loss in ((10.0, residual**2), (2.0, 2 * 2.0 * residual - 4.0)):
         terms = PLAIN._replace(huber=huber)
-        cost = evaluate(SAMPSON, rays, NO_RAYS, terms, state.parameters, state.rotation, rays[:, DEPTH].copy(), sums)
+        met = rays[:, Ray.DEPTH].copy()
+        cost = evaluate(SAMPSON, rays, NO_RAYS, terms, state.parameters, state.rotation, met, sums)
         assert cost == pytest.approx(loss)
     distance = surface_distance(rays, state.parameters, state.rotation)
     assert distance[0] == pytest.approx(0.01)

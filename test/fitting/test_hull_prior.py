@@ -12,7 +12,7 @@ from sq_perception.fitting import priors, quality, surface_fit
 from sq_perception.fitting.cost import RAY_COLUMNS, STEP_LENGTH, Rays, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize, move
 from sq_perception.fitting.observation import Crop
-from sq_perception.fitting.priors import MODEL_SHARE, PULL_SHARE, HullPrior, prior_cost
+from sq_perception.fitting.priors import MODEL_SHARE, HullPrior, prior_cost
 from sq_perception.fitting.quality import covariance_at
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import rotation
@@ -36,7 +36,7 @@ def terms_of(prior: HullPrior) -> Terms:
     return Terms(
         hull_directions=np.array(prior.directions),
         hull_support=prior.support,
-        hull_root=prior.root(),
+        hull_root=prior.root,
         hull_freedom=float(prior.freedom),
     )
 
@@ -45,17 +45,7 @@ def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rn
     spread = rng.normal(size=(42, 42))
     prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 0.2)
     whole = prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
-    assert prior.root() @ whole @ prior.root().T == pytest.approx(np.eye(42), abs=1e-8)
-
-
-def test_misfit_draws_each_direction_to_the_prediction_and_leaves_growth_alone(rng: np.random.Generator) -> None:
-    spread = rng.normal(size=(42, 42))
-    prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 0.2)
-    difference = prior.root(4.0).T @ prior.root(4.0) - prior.root().T @ prior.root()
-    assert difference @ np.ones(42) == pytest.approx(np.zeros(42), abs=1e-6)
-    for other in rng.normal(size=(5, 42)):
-        other -= other.mean()
-        assert other @ difference @ other == pytest.approx(3.0 / (PULL_SHARE * 0.2) ** 2 * float(other @ other))
+    assert prior.root @ whole @ prior.root.T == pytest.approx(np.eye(42), abs=1e-8)
 
 
 def test_a_bottle_is_as_long_wide_and_high_as_its_hull_is_predicted() -> None:
@@ -88,7 +78,7 @@ def test_the_true_body_costs_nothing_and_others_by_their_distance() -> None:
     assert prior_cost(terms_of(prior), state.parameters, state.rotation, sums) == pytest.approx(0.0, abs=1e-12)
     moved = state.parameters.copy()
     moved[5] += 0.01
-    error = prior.root() @ (DIRECTIONS[:, 0] * 0.01)
+    error = prior.root @ (DIRECTIONS[:, 0] * 0.01)
     assert prior_cost(terms_of(prior), moved, state.rotation, sums) == pytest.approx(float(error @ error))
 
 
@@ -117,14 +107,19 @@ def rays_of_body() -> Rays:
     shown, _ = raycast.render(BODY, CAMERA)
     crop = Crop.around(shown, np.isfinite(shown), CAMERA, 0.002)
     assert crop is not None
-    return Rays(crop.observed(0.0, None).object_rays(200), np.empty((0, RAY_COLUMNS)))
+    return Rays(crop.observe(0.0, None).object_rays(200), np.empty((0, RAY_COLUMNS)))
+
+
+def covariance_of(state: State, rays: Rays, terms: Terms) -> np.ndarray:
+    outline = terms._replace(outline_stiffness=1 / 0.002)
+    return covariance_at(*rays, outline, state.parameters, state.rotation)
 
 
 def test_a_body_beside_its_predicted_hull_is_as_much_less_sure(rays_of_body: Rays) -> None:
     """Every end of it is 3 mm off; what the rays say of it stays as sure as it is."""
     prior, state = told(BODY, 0.004), State.of(BODY)
     beside = replace(prior, support=prior.support + 0.003)
-    on, off = (covariance_at(state, rays_of_body, terms_of(hull), 0.002) for hull in (prior, beside))
+    on, off = (covariance_of(state, rays_of_body, terms_of(hull)) for hull in (prior, beside))
     more = np.zeros(11)
     more[[0, 1, 2, 5, 6, 7]] = 0.003**2
     assert off - on == pytest.approx(np.diag(more), abs=1e-12)
@@ -133,11 +128,11 @@ def test_a_body_beside_its_predicted_hull_is_as_much_less_sure(rays_of_body: Ray
 def test_the_farther_off_the_vaguer_a_hull_of_long_tails(rays_of_body: Rays) -> None:
     prior, state = told(BODY, 0.004), State.of(BODY)
     beside = replace(prior, support=prior.support + 0.003, freedom=3.0)
-    square = float(np.square(prior.root() @ np.full(len(DIRECTIONS), 0.003)).sum())
-    root = beside.root() / math.sqrt(1 + square / 3.0)
+    square = float(np.square(prior.root @ np.full(len(DIRECTIONS), 0.003)).sum())
+    root = beside.root / math.sqrt(1 + square / 3.0)
     vaguer = terms_of(beside)._replace(hull_root=root, hull_freedom=math.inf)
-    found = covariance_at(state, rays_of_body, terms_of(beside), 0.002)
-    assert found == pytest.approx(covariance_at(state, rays_of_body, vaguer, 0.002), rel=1e-6, abs=1e-12)
+    found = covariance_of(state, rays_of_body, terms_of(beside))
+    assert found == pytest.approx(covariance_of(state, rays_of_body, vaguer), rel=1e-6, abs=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -215,9 +210,7 @@ def test_a_thing_cut_short_is_no_surer_than_one_with_time(
     )
     assert "time budget" in hasty.message
     by_length = [fit.sigma_size[np.argsort(fit.superquadric.size)] for fit in (hasty, patient)]  # z may be another axis
-    assert np.exp(np.log(by_length[0] / by_length[1]).mean()) > 0.9
-    if not (by_length[0] > 0.9 * by_length[1]).all():
-        pytest.xfail("along one axis a thing cut short is surer than one with time")
+    assert (by_length[0] > 0.9 * by_length[1]).all()
 
 
 def test_no_form_of_a_hull_is_compiled_for(
@@ -232,5 +225,5 @@ def test_no_form_of_a_hull_is_compiled_for(
     forms = []
     for hull in (usual, single, fixed):
         surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane, model_error=0.0025, hull=hull))
-        forms.append([len(form.signatures) for form in (minimize, quality._covariance, priors.hull_distances)])
+        forms.append([len(form.signatures) for form in (minimize, quality.covariance_at, priors.hull_distances)])
     assert forms[0] == forms[1] == forms[2]

@@ -62,7 +62,7 @@ def test_a_right_mask_keeps_its_pixels_whatever_the_plane(rng: np.random.Generat
     depth, mask = image(BOX, rng)
     crop = Crop.around(depth, mask, CAMERA, None)
     assert crop is not None
-    known, unknown = crop.observed(0.0025, None, TABLE), crop.observed(0.0025, None)
+    known, unknown = crop.observe(0.0025, None, TABLE), crop.observe(0.0025, None)
     np.testing.assert_array_equal(known.pixels, unknown.pixels)
 
 
@@ -71,7 +71,7 @@ def test_a_thing_of_which_most_is_as_low_as_its_support_keeps_its_pixels(rng: np
     crop = Crop.around(depth, mask, CAMERA, None)
     assert crop is not None
     above = TABLE - [0.0, 0.0, 0.0, 2 * HALF]  # a plane through its top
-    assert len(crop.observed(0.0025, None, above).pixels) == len(crop.observed(0.0025, None).pixels)
+    assert len(crop.observe(0.0025, None, above).pixels) == len(crop.observe(0.0025, None).pixels)
 
 
 @pytest.mark.parametrize("nothing", [np.inf, -np.inf, 0.0, -1.0])

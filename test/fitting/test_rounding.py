@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.cost import DEPTH, RAY_COLUMNS
+from sq_perception.fitting.cost import Ray
 from sq_perception.fitting.valleys import faces_camera
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
@@ -15,10 +15,10 @@ from sq_perception.imaging import raycast, unit_cube
 
 def test_one_depth_in_common_makes_a_face(rng: np.random.Generator) -> None:
     step = 1 / 256
-    rays = np.zeros((1000, RAY_COLUMNS))
-    rays[:, DEPTH] = np.round(rng.uniform(0.2, 0.8, 1000) / step) * step
+    rays = np.zeros((1000, len(Ray)))
+    rays[:, Ray.DEPTH] = np.round(rng.uniform(0.2, 0.8, 1000) / step) * step
     assert not faces_camera(rays, step)
-    rays[:100, DEPTH] = 128 * step
+    rays[:100, Ray.DEPTH] = 128 * step
     assert faces_camera(rays, step)
 
 

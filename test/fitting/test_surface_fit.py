@@ -549,7 +549,7 @@ def test_a_hole_that_the_sensor_left_is_no_hole_in_the_body(behind: float) -> No
 def test_a_hull_that_encloses_most_of_a_thing_is_weak(typical: float, as_hull: bool, status: Status) -> None:
     """A quarter of the smallest half size, 20 mm, may stray; out of a hull, as much as the middle one sticks out."""
     body = Superquadric([0.02, 0.03, 0.04], [0.5, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
-    found, message = quality.status(body, 1e-8 * np.eye(11), typical, 1e-4, as_hull)
+    found, message = quality.judge(body, 1e-8 * np.eye(11), typical, 1e-4, as_hull)
     assert found == status
     assert ("off" in message) == (status != Status.CONVERGED)
 

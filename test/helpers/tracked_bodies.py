@@ -83,7 +83,7 @@ def draw(truth, covariance, rng, form=None, error=None):
     metres = state.scale_sizes(covariance, truth.size)
     form = rng.integers(8) if form is None else form
     other = seen.equivalent_forms()[int(form)]
-    return Seen(other, quality.carried_over(metres, seen, other))
+    return Seen(other, quality.covariance_of_form(metres, seen, other))
 
 
 def exchanged(seen, turn):
