@@ -3,10 +3,11 @@
 For a segment a of :mod:`sq_perception.segmentation.segments` it predicts p_a(x), the probability that the reading of a
 pixel x is of the object that most of a shows (:mod:`sq_perception.learning.networks`).
 
-    parted    if the mean of p_a over one of four compact pieces of a is below ``_SURE``, the network is asked about
-              that piece as if it were a segment, and then about pieces that no object claims.  A piece shows another
-              object if it claims itself, and if it and the objects found so far do not claim each other: if the means
-              of p are below ``_APART``.  A pixel is of the object that claims it most
+    parted    a has four compact pieces, and one more for each connected region where p_a < 1/2.  If the mean of p_a
+              over a piece is below ``_SURE``, the network is asked about that piece as if it were a segment, and then
+              about pieces that no object claims.  A piece shows another object if it claims itself, and if it and the
+              objects found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the
+              object that claims it most
     joined    a and b are one with log odds of k (l_ab + l_ba) + c, by the mean l_ab of the logit of p_a over b; the
               surest pairs first, until none is more likely one than two.  Not where both together are larger than
               ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
@@ -27,6 +28,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from sq_perception.fitting.options import MIN_PIXELS
@@ -48,6 +50,8 @@ _SURE = 0.85
 """A segment is parted only if a piece of it claims less."""
 _APART, _ITSELF = 0.3, 0.5
 """Pieces that claim less of each other are of two objects; one that claims less of itself shows none."""
+_LEAST_PIECE = 12
+"""Cells of a region with p < 1/2 that is a piece of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +192,12 @@ def _doubt(answer: _Seen) -> tuple[np.ndarray, np.ndarray] | None:
     if not len(rows):
         return None
     pieces = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
+    unlikely = (cells & (answer.logits < 0)).view(np.uint8)
+    count, region, sizes, _ = cv2.connectedComponentsWithStats(unlikely, connectivity=8)
+    for k in range(1, count):
+        if sizes[k, cv2.CC_STAT_AREA] >= _LEAST_PIECE:
+            pieces[region == k] = 3 + k
+    pieces[cells] = np.unique(pieces[cells], return_inverse=True)[1]  # a region may be all of a compact piece
     sure = _means(answer.logits, pieces)
     return (pieces, sure) if sure.min() < _SURE else None
 

@@ -147,6 +147,26 @@ def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
     assert abs(len(first) - len(second)) < 0.2 * len(first)
 
 
+def test_a_small_object_amid_a_segment_is_parted_from_it() -> None:
+    """The network sees a small object in the middle; each of the four compact pieces shows the large one mostly."""
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
+    middle: list[np.ndarray] = []
+
+    def claims(views: np.ndarray) -> np.ndarray:
+        mine = views[..., segment_view.SEGMENT] > 0
+        if not middle:
+            rows, columns = np.nonzero(mine[0])
+            row, column = (np.abs(np.arange(mine.shape[1]) - np.median(each)) for each in (rows, columns))
+            middle.append((row[:, None] < len(np.unique(rows)) / 6) & (column < len(np.unique(columns)) / 6))
+        of_small = (mine & middle[0]).sum(axis=(1, 2)) > (mine & ~middle[0]).sum(axis=(1, 2))
+        return np.where(middle[0] == of_small[:, None, None], 3.0, -3.0)
+
+    found = of(GivenLogits(claims), depth).improved(segmentation(truth))
+    assert found.ids == (1, 2)
+    small, large = sorted(np.bincount(found.labels.ravel())[1:])
+    assert 0.05 < small / large < 0.2
+
+
 def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     """The network sees an object in the right half, and none in the left one, as where a sensor smeared an edge."""
 
@@ -289,7 +309,7 @@ def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quar
     """Their answers are turned back: the upper half of the can is the object, whatever is up in the image."""
 
     def upper(views: np.ndarray) -> np.ndarray:
-        there = views[..., segment_view.SEGMENT] > 0
+        there = (views[..., [segment_view.SEGMENT, segment_view.OTHERS]] > 0).any(axis=-1)
         rows = np.arange(views.shape[1])[:, None]
         return np.where(there & (rows < views.shape[1] / 2), 5.0, -5.0)
 
