@@ -3,11 +3,11 @@
 For a segment a of :mod:`sq_perception.segmentation.segments` it predicts p_a(x), the probability that the reading of a
 pixel x is of the object that most of a shows (:mod:`sq_perception.learning.networks`).
 
-    parted    a has four compact pieces, and one more for each connected region where p_a < 1/2.  If the mean of p_a
-              over a piece is below ``_SURE``, the network is asked about that piece as if it were a segment, and then
-              about pieces that no object claims.  A piece shows another object if it claims itself, and if it and the
-              objects found so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the
-              object that claims it most
+    parted    a has four compact pieces, and one more for each connected region, less than half of a, where p_a < 1/2.
+              If the mean of p_a over a piece is below ``_SURE``, the network is asked about that piece as if it were a
+              segment, and then about pieces that no object claims.  A piece shows another object if it claims itself,
+              and if it and the objects found so far do not claim each other: if the means of p are below ``_APART``.
+              A pixel is of the object that claims it most
     joined    a and b are one with log odds of k (l_ab + l_ba) + c, by the mean l_ab of the logit of p_a over b; the
               surest pairs first, until none is more likely one than two.  Not where both together are larger than
               ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
@@ -195,9 +195,9 @@ def _doubt(answer: _Seen) -> tuple[np.ndarray, np.ndarray] | None:
     unlikely = (cells & (answer.logits < 0)).view(np.uint8)
     count, region, sizes, _ = cv2.connectedComponentsWithStats(unlikely, connectivity=8)
     for k in range(1, count):
-        if sizes[k, cv2.CC_STAT_AREA] >= _LEAST_PIECE:
+        if _LEAST_PIECE <= sizes[k, cv2.CC_STAT_AREA] < len(rows) / 2:  # p is of what most of the segment shows
             pieces[region == k] = 3 + k
-    pieces[cells] = np.unique(pieces[cells], return_inverse=True)[1]  # a region may be all of a compact piece
+    pieces[cells] = np.unique(pieces[cells], return_inverse=True)[1]  # none is empty
     sure = _means(answer.logits, pieces)
     return (pieces, sure) if sure.min() < _SURE else None
 

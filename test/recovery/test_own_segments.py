@@ -161,7 +161,7 @@ def test_a_small_object_amid_a_segment_is_parted_from_it() -> None:
         of_small = (mine & middle[0]).sum(axis=(1, 2)) > (mine & ~middle[0]).sum(axis=(1, 2))
         return np.where(middle[0] == of_small[:, None, None], 3.0, -3.0)
 
-    found = of(GivenLogits(claims), depth).improved(segmentation(truth))
+    found = of(GivenLogits(claims), depth).improve(segmentation(truth))
     assert found.ids == (1, 2)
     small, large = sorted(np.bincount(found.labels.ravel())[1:])
     assert 0.05 < small / large < 0.2
