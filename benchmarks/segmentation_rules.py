@@ -20,8 +20,8 @@ errors has no place in the package.  results/segmentation_rules_before.md has th
 names a file of JSON lines, one a scene, that a run adds to: a run that was stopped goes on, and one of more scenes or
 other seeds counts them together.
 
-``--unlabelled`` takes recorded frames (NPZ with depth and K) without masks: how many of them a rule changes, and the
-segments with it, and without it, that no other one overlaps by an IoU of 0.8.
+``--unlabelled`` takes recorded frames (NPZ with depth, K and, in words, ``source``) without masks: how many of them a
+rule changes, and the segments with it, and without it, that no other one overlaps by an IoU of 0.8.
 """
 
 from __future__ import annotations
@@ -169,8 +169,11 @@ def unlabelled(folder: Path, rules: list[str]) -> tuple[dict[str, Any], str]:
     """What each rule changes in frames without masks."""
     changes: dict[str, list[tuple[int, int]]] = {rule: [] for rule in rules}
     count = 0
+    sources = set()
     for path in sorted(folder.glob("*.npz")):
         frame = read_frame(path)
+        with np.load(path) as file:
+            sources |= {str(file["source"])} if "source" in file else set()
         answers: dict[bytes, np.ndarray] = {}
         base = segmented(frame.depth, frame.camera, "", answers)
         count += len(np.unique(base[base > 0]))
@@ -185,7 +188,9 @@ def unlabelled(folder: Path, rules: list[str]) -> tuple[dict[str, Any], str]:
     rows = [[rule, *map(str, one.values())] for rule, one in found.items()]
     frames_ = len(next(iter(changes.values())))
     table = report.table(["rule", "frames that differ", "segments only with it", "segments only without it"], rows)
-    return {"frames": frames_, "segments": count, "rules": found}, f"{frames_} frames, {count} segments\n\n{table}"
+    head = f"{frames_} frames, {count} segments. Sources: {', '.join(sorted(sources)) or 'unknown'}"
+    result = {"frames": frames_, "segments": count, "sources": sorted(sources), "rules": found}
+    return result, f"{head}\n\n{table}"
 
 
 def unlike(labels: np.ndarray, others: np.ndarray) -> int:
