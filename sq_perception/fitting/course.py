@@ -54,8 +54,8 @@ EXPLAINS = 1.4
 """Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
 not finished.  Chosen on benchmarks/single_body."""
 _PROMISING = 2.0
-"""Mean squared residual after the few steps from a group of starts, above which the next group is tried first.  Of 42
-images that a body explains, none left more than 0.8; of 80 that none explains, nine in ten left more than this."""
+"""Mean squared residual after the few steps from a group of starts, above which the next group is tried first:
+images that a body explains leave 0.8 at most, most others more than this."""
 FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
 """Object rays of the last stage, and most of them under much noise: a depth error of a third of a pixel's width
 averages out to a two hundredth.  Chosen on benchmarks/single_body."""

@@ -23,8 +23,8 @@ n_j, b and S are in the optical frame of the camera, metres.  No thing is a supe
 is added to S as an independent error of each direction, ``MODEL_SHARE`` of the thing's extent.
 
 The network predicts h ~ t_nu(b, S) with long tails (:mod:`sq_perception.learning.networks`); the fit takes S
-alone, the scale of most errors.  With the tails the fit follows bodies that few directions agree with: that cost 1.3 %
-of IoU on 229 things of benchmarks/household_things, seeds from 5000.  The covariance of the fitted body depends on them
+alone, the scale of most errors.  With the tails the fit follows bodies that few directions agree with: that costs 1.3 %
+of IoU on household things.  The covariance of the fitted body depends on them
 (:mod:`sq_perception.fitting.quality`).
 """
 

@@ -9,8 +9,7 @@ noise or a whole pixel, whichever is more: its errors are no independent noise.
 A predicted hull comes with its own error model, so its residuals r_h are not among r: J_h^T J_h / (1 + |r_h|^2 / nu) is
 added to J^T J / s^2.  The farther off the hull a body is, the less the hull counts, like the weight
 (nu + J) / (nu + |r_h|^2) of a t distribution with nu degrees of freedom in J directions; but the factor begins at 1,
-not at 1 + J / nu, 15 here: with that, 91 instead of 97 % of the half sizes of 196 things of
-benchmarks/household_things, seeds from 7000, are within two deviations, and sigma and error rank less alike.
+not at 1 + J / nu, 15 here: with that, deviations are too small, and sigma and error rank less alike.
 
 The above describes one valley of the cost, as if the thing were a superquadric.  Other bodies that the image allows add
 their second moments about the result, and so does a predicted hull that the body does not match.
@@ -51,9 +50,7 @@ _REACHED = 0.9
 """Share of the points of a thing fitted as a hull: how far the rest sticks out decides whether it is enclosed."""
 _ENCLOSED_SHARE = 1.0
 """Share of the middle half size by which points may stick out of a hull: a body that encloses a thing but for a
-trigger, a spout or a rim is one that a planner can use with care.  Of 3582 things of benchmarks/household_things ten
-well measured ones left more than the smallest half size of their hull: seven less than this, of IoU 0.33 to 0.80, and
-three more, of 0.24 to 0.43."""
+trigger, a spout or a rim is one that a planner can use with care; those that left out more had an IoU below 0.45."""
 _UNFINISHED = "how far it is off is not known"
 _AXES = "xyz"
 

@@ -18,10 +18,10 @@ LEAST_ENGAGED = 0.004
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
 """Standard deviation, metres, to which thinned points tell where an object's side is that the image shows a finger to
-pass: of 247 such sides, 3.3 mm with the 2 mm of the hand (30 scenes of benchmarks/picking.py from seed 30010 on)."""
+pass: in benchmarks/picking.py 3.3 mm with the 2 mm of the hand."""
 PASSES = 0.001
 """Metres by which a finger may come down on the edge of an object: half of those that did passed it and pushed it aside
-(60 household objects in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
+(a quarter at 2 mm, few at 3)."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
 
 
@@ -66,8 +66,7 @@ class Trials(NamedTuple):
 
 def log_passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
     """Return log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
-    # Sides are nearer than fits say, by 0.4 sigma: medians of 0.3 to 0.6 of 797 tried sides known to more than 3.5 mm
-    # (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported).
+    # Sides are nearer than fits say, by 0.4 sigma in the median over benchmarks/picking.py (not its reported scenes).
     return log_phi(gap + PASSES + 0.4 * sigma, np.hypot(sigma, placement))
 
 

@@ -36,8 +36,7 @@ PIXELS = 64
 CHANNELS = 9
 MEASURED, NEARNESS, HEIGHT, SEGMENT, OTHERS, IMAGE, SCALE, GRAIN, PLANE = range(CHANNELS)
 _POINTS = 3
-"""Points of a cell along each axis.  A network trained on the same views, shown one point, leaves as many outliers in
-others; of 29 recorded things its own masks give 81.9, not 82.4 % IoU."""
+"""Points of a cell along each axis."""
 
 
 @dataclass(frozen=True, eq=False)

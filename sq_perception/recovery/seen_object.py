@@ -36,8 +36,7 @@ _LOWEST = 0.02
 """Share of its pixels that are an object's lowest."""
 _SURROUNDED, _RIM_HEIGHT = 0.6, 0.01
 """Share of the pixels next to a given mask that go on with it, this many metres above its support, if it is too small.
-Of the second row of pixels around 200 things of benchmarks/household_things 4 % do typically, 50 % of one in twenty;
-70 % where masks are two pixels too small."""
+Of the second row of pixels around household things 4 % do typically, 70 % where masks are two pixels too small."""
 _LEAST_ROWS, _MOST_ROWS = 2, 4
 """By how many pixels a given mask is too small, if it is: a sensor widens an edge by one."""
 

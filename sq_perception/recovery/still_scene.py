@@ -69,8 +69,8 @@ _PATCH, _NEW = 7, 3.5
 """Compared pixels across, and mean of q in noise levels, of a patch that shows something new.  An edge that wanders
 fills half of it."""
 _BESIDE = 3
-"""Compared pixels up to which a new reading may go on with an old one.  Without, 5 of 96 frames of still
-scenes of five simulated things had a patch that looked new; one with it."""
+"""Compared pixels up to which a new reading may go on with an old one; without, one frame in
+twenty of a still scene has a patch that looks new."""
 _BLOCK = 8
 """Compared pixels across which noise may be shared."""
 _QUARTILE = 1.15

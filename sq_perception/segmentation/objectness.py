@@ -35,7 +35,7 @@ import numpy as np
 from sq_perception.segmentation.support_plane import LEAST_SIGMA
 
 _WEIGHTS = (1.08, 9.8, -22.6)
-"""a, b, c, by 8 504 segments of 900 scenes of benchmarks/common/segmentation_scenes (seeds from 300 000)."""
+"""a, b, c, a regression on segments of benchmarks/common/segmentation_scenes."""
 _MOST_SURE = 8.0
 """z_most: a segment that rises more is surely no bump, and a wall rises as well."""
 _UNASKED = 3.4
@@ -43,10 +43,10 @@ _UNASKED = 3.4
 LEAST = 0.2
 """What is less likely a thing is left out: a thing that is missed costs as much as four bodies of nothing."""
 _BODY_WEIGHTS = (0.65, -0.75, 0.95, -1.3)
-"""a', b', c', d', a regression on bodies of benchmarks/household_things (seeds from 60 000).  The score of the body,
-the affinity to larger segments, contact with them, and what hides the segment add nothing to it."""
+"""a', b', c', d', a regression on bodies of benchmarks/household_things.  The score of the body, the affinity to larger
+segments, contact with them, and what hides the segment add nothing to it."""
 LEAST_POSTERIOR = 0.35
-"""What is less likely a thing is left out with its body; chosen on seeds from 64 000."""
+"""What is less likely a thing is left out with its body."""
 _BLOCKS = (4, 32)
 """Pixels a side of the smallest and the largest block of the support."""
 _SUPPORT = 0.03

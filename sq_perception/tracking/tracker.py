@@ -38,8 +38,7 @@ COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
 """rho and gamma, the shares of an observation's covariance that views from one direction, and all views, have in
 common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
 PREDICTED_SHARE = 0.6
-"""gamma of bodies beside a predicted hull.  Of 263 household things, own masks, 20 frames of a camera that goes 60
-degrees about them, 90 instead of 84 % of the half sizes are within two deviations, of single frames 93 %."""
+"""gamma of bodies beside a predicted hull, which errs alike in all frames."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
 PATIENCE = 2
