@@ -211,7 +211,7 @@ def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
     weight = 0.5 / (2 * _RESOLUTION) ** 2
     owners = np.full(sum(len(each) for each in sides), -1)
     return surface._replace(
-        probes=np.concatenate(probes), sides=np.concatenate(sides), owners=owners, probe_weight=weight
+        probes=np.concatenate(probes).copy(order="C"), sides=np.concatenate(sides), owners=owners, probe_weight=weight
     )
 
 

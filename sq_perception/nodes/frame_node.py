@@ -274,8 +274,9 @@ class FrameNode(ManagedNode):
         self._statistics.answer(stages, summary)
         if found.recovery.doubt:
             self._statistics.doubt(found.recovery.doubt)
-        if found.recovery.doubt or (found.recovery.bodies and found.recovery.message):
             self.get_logger().warning(found.recovery.message, throttle_duration_sec=THROTTLE)
+        elif found.recovery.bodies and found.recovery.message:
+            self.get_logger().info(found.recovery.message, throttle_duration_sec=THROTTLE)
         return Outcome(True, summary, shown)
 
     def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:

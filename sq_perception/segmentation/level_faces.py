@@ -56,15 +56,15 @@ def find_faces(
 
 
 def find_above(
-    label: int, face: SupportSurface, labels: np.ndarray, depth: np.ndarray, camera: Camera
+    label: int, points: np.ndarray, face: SupportSurface, labels: np.ndarray, depth: np.ndarray, camera: Camera
 ) -> np.ndarray:
-    """Find the pixels (height, width) of a segment with a level face and of all whose middle is right above it."""
+    """Find the pixels (height, width) of a segment with a level face, known by its points (n, 3), and of all segments
+    whose middle is right above it.  Other faces may have taken all pixels of the segment by now."""
     axes = TURNS @ across(face.plane.equation[:3]).T
-    some = samples(labels, depth, camera, 1)
-    low, high = (axes @ some[label].T).min(axis=1), (axes @ some[label].T).max(axis=1)
+    low, high = (axes @ points.T).min(axis=1), (axes @ points.T).max(axis=1)
     is_over = np.zeros(int(labels.max()) + 1, bool)
-    for other, points in some.items():
-        middle = np.median(axes @ points.T, axis=1)
+    for other, some in samples(labels, depth, camera, 1).items():
+        middle = np.median(axes @ some.T, axis=1)
         is_over[other] = other == label or ((middle > low) & (middle < high)).all()
     return is_over[labels]
 

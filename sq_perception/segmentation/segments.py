@@ -101,7 +101,8 @@ def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] 
     labels = _find_raised(known, camera, relative, valid, support)
     tops = level_faces.samples(labels, known, camera, least)
     for label, face in level_faces.find_faces(tops, labels, known, camera, support, least).items():
-        labels = _unload(labels, label, face, known, camera, least)
+        valid = level_faces.find_above(label, tops[label], face, labels, known, camera)
+        labels = _unload(labels, valid, face, known, camera, least)
     around = container_walls.walls(tops, plane.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
     found = _order(FrameEvidence(labels, support=support), least)
@@ -231,11 +232,11 @@ def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least
 
 
 def _unload(
-    labels: np.ndarray, label: int, face: SupportSurface, known: np.ndarray, camera: Camera, least: int
+    labels: np.ndarray, above: np.ndarray, face: SupportSurface, known: np.ndarray, camera: Camera, least: int
 ) -> np.ndarray:
-    """Give what stands on the level face of a segment labels of its own, found with the face as support."""
+    """Give what stands on a level face, among the pixels ``above`` it, labels of its own, found with it as support."""
     relative = face.image_relative(known, camera)
-    valid = level_faces.find_above(label, face, labels, known, camera) & (relative > -TOLERANCE)
+    valid = above & (relative > -TOLERANCE)
     parts = _order(FrameEvidence(_find_raised(known, camera, relative * valid, valid, face)), least)
     heights = HeightEvidence(relative, np.where(valid, parts.labels, 1), face.sigma)
     parts = judge(replace(parts, heights=heights))

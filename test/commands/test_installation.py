@@ -7,11 +7,14 @@ import subprocess
 import sys
 
 import numpy as np
+import trimesh
 from numba.core.dispatcher import Dispatcher
 
 from sq_perception import __version__
 from sq_perception.commands import installation, main
-from sq_perception.fitting import levenberg_marquardt
+from sq_perception.fitting import levenberg_marquardt, point_cost
+from sq_perception.fitting.decomposition import decompose
+from sq_perception.fitting.points import fit_mesh, fit_points
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import TABLE_CAMERA, draw_crowd, table_scene
@@ -96,3 +99,12 @@ def test_frames_call_no_kernel_that_the_warm_up_did_not_compile() -> None:
     assert {name: new for name, of in compiled().items() if (new := of - known.get(name, set()))} == {}
     # One form of arguments, whatever array a hull's directions came in: a second one takes 18 s and 13 MB.
     assert len(levenberg_marquardt.minimize.signatures) == 1
+
+
+def test_meshes_call_the_kernels_of_clouds():
+    mesh = trimesh.creation.cylinder(radius=0.03, height=0.1)
+    fit_points(np.array(mesh.sample(500, seed=0)))
+    known = set(point_cost.maximize.signatures)
+    fit_mesh(mesh)
+    decompose(mesh)
+    assert set(point_cost.maximize.signatures) == known

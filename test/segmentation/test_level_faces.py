@@ -71,9 +71,12 @@ def test_the_face_is_that_of_the_carton(seed):
     assert face.plane.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
     middle = table.origin + TOP * table.plane[:3]
     assert face.plane.height(middle) == pytest.approx(0, abs=2e-3)
-    above = level_faces.find_above(1, face, labels, known, VGA)
+    points = level_faces.samples(labels, known, VGA, 1)[1]
+    above = level_faces.find_above(1, points, face, labels, known, VGA)
     assert above[truth == 1].all()
     assert not above[truth == 3].any()
+    taken = np.where(truth == 3, 3, 0).astype(np.int32)  # as by another face
+    assert not level_faces.find_above(1, points, face, taken, known, VGA)[truth == 3].any()
 
 
 def test_the_seat_of_a_stool_is_a_face_though_it_is_the_lowest_that_is_seen_of_it():
