@@ -70,7 +70,7 @@ RULES: dict[str, dict[str, Any]] = {
     "pieces: of all": {f"{_S}.convex_parts._pieces": lambda *_: []},
     "pieces: as large near by (_NEAR)": {f"{_S}.line_of_sight._NEAR": 1e-6},
     "pieces: nearest first (_METRIC)": {f"{_S}.convex_parts._METRIC": 0.0},
-    "pieces: a step of 5 mm (_LEAST_GAP)": {f"{_S}.line_of_sight._LEAST_GAP": 0.0},
+    "pieces: a step of 5 mm (_LEAST_GAP)": {f"{_S}.line_of_sight.SampledImage.__init__.__defaults__": (0.0,)},
     "vessels: insides and walls": {f"{_S}.convex_parts._rims": lambda *_: np.empty((0, 2), int)},
     "vessels: pieces (_with_whole_vessels)": {f"{_S}.convex_parts._with_whole_vessels": lambda group, *_: group},
     "behind something nearer (_ALONG)": {f"{_S}.convex_parts._ALONG": 1.0},
