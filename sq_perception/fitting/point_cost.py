@@ -179,5 +179,7 @@ def maximize(
                 holds = 1.0 if cloud.owners[i] < 0 else probability[cloud.owners[i]].sum()
                 rays[n + i, Ray.WEIGHT] = holds * cloud.probe_weight if is_its else 0.0
             start_k = State(bodies[k], turns[k], np.inf, 0)
-            bodies[k], turns[k], _, _ = minimize(FOOT, rays, no_free, terms, start_k, limits, 2, 1e-6)
+            # Not the literals: minimize would be compiled once more for them.
+            residual, steps = int(FOOT), int(np.int64(2))
+            bodies[k], turns[k], _, _ = minimize(residual, rays, no_free, terms, start_k, limits, steps, 1e-6)
     return Mixture(bodies, turns, sigma, share, likelihood)
