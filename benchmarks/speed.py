@@ -28,6 +28,7 @@ import cProfile
 import pstats
 import sys
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
@@ -42,7 +43,7 @@ from synthetic_tabletop import STAGES, scored
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.geometry import metrics
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery import recoverer
+from sq_perception.recovery import readings, recoverer, recovery
 from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery
 
@@ -186,7 +187,9 @@ def main() -> None:
     rows: dict[str, dict[str, Any]] = {}
     chain = recoverer.Recoverer(threads=1)
     by_processor = SimpleNamespace(perf_counter=time.process_time)
-    with mock.patch.object(recoverer, "time", by_processor):
+    with ExitStack() as clocks:
+        for module in (readings, recoverer, recovery):
+            clocks.enter_context(mock.patch.object(module, "time", by_processor))
         for work in works():
             chain.warm_up(work.camera)
             rows[work.name] = measured(chain, work, options.repeats)
