@@ -51,7 +51,7 @@ _SURE = 0.85
 _APART, _ITSELF = 0.3, 0.5
 """Pieces that claim less of each other are of two objects; one that claims less of itself shows none."""
 _LEAST_PIECE = 12
-"""Cells of a region with p < 1/2 that is a piece of its own."""
+"""Cells of a region with p < 1/2, without its thin parts, that is a piece of its own."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,6 +193,8 @@ def _doubt(answer: _Seen) -> tuple[np.ndarray, np.ndarray] | None:
         return None
     pieces = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
     unlikely = (cells & (answer.logits < 0)).view(np.uint8)
+    # An object is wide; the rims that a sensor adds are outliers, and not worth a question.
+    unlikely = cv2.morphologyEx(unlikely, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, region, sizes, _ = cv2.connectedComponentsWithStats(unlikely, connectivity=8)
     for k in range(1, count):
         if _LEAST_PIECE <= sizes[k, cv2.CC_STAT_AREA] < len(rows) / 2:  # p is of what most of the segment shows
