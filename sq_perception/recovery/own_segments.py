@@ -194,8 +194,8 @@ def _doubt(answer: _Seen) -> tuple[np.ndarray, np.ndarray] | None:
     pieces = segment_view.compact_pieces(cells, 4, (rows.mean(), columns.mean()))
     unlikely = (cells & (answer.logits < 0)).view(np.uint8)
     # An object is wide; the rims that a sensor adds are outliers, and not worth a question.
-    unlikely = cv2.morphologyEx(unlikely, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    count, region, sizes, _ = cv2.connectedComponentsWithStats(unlikely, connectivity=8)
+    wide = cv2.morphologyEx(unlikely, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, region, sizes, _ = cv2.connectedComponentsWithStats(wide, connectivity=8)
     for k in range(1, count):
         if _LEAST_PIECE <= sizes[k, cv2.CC_STAT_AREA] < len(rows) / 2:  # p is of what most of the segment shows
             pieces[region == k] = 3 + k
