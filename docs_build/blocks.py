@@ -225,12 +225,10 @@ def public() -> str:
 ABLATIONS = {
     "whole": "as shipped",
     "no predicted hull": "no predicted hull",
-    
     "no plane": "no support plane",
     "no free space": "no free space",
     "missing is empty": "missing readings count as empty space",
     "half the error": "predicted hull with half the error",
-    
     "true hull": "true hull instead of the predicted one",
 }
 """Rows of the ablation that are shown."""

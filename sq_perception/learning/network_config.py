@@ -17,7 +17,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning.choices import SIZE_RANGE, Backbone, Framing
+from sq_perception.learning.choices import Backbone, Framing
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -44,8 +44,8 @@ class RegressorConfig:
     blocks: int = 2
     """For compact: residual blocks a stage."""
     hidden: int = 256
-    size_range: tuple[float, float] = SIZE_RANGE
-    """Half sizes in sides of the cube; interpolated on a logarithmic scale."""
+    size_range: tuple[float, float] = (0.04, 1.2)
+    """Half sizes in sides of the cube, interpolated on a logarithmic scale; the thesis' bodies reach 0.8."""
     shape_range: tuple[float, float] = (0.1, 1.0)
     translation_range: tuple[float, float] = (-0.4, 1.4)
     backbone: Backbone = "compact"

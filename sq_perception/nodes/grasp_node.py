@@ -23,6 +23,7 @@ from typing import Any, cast
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -41,7 +42,6 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.managed_node import ManagedNode, optional
-from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, check_prefix, setting
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
@@ -139,7 +139,7 @@ class GraspNode(ManagedNode):
             if self._outputs and self._last is not None and self.context.ok():
                 shown = self._outputs[-1]
                 shown.publish(markers([], [], self._last.header, namespace="grasps"))
-                shown.wait_for_all_acked(ARRIVAL)
+                shown.wait_for_all_acked(Duration(seconds=0.5))  # before the publisher is destroyed
             for publisher in (*self._outputs, *([] if self._array is None else [self._array])):
                 self.destroy_publisher(publisher)
             self._outputs, self._array = [], None

@@ -46,8 +46,6 @@ from sq_perception.recovery.recoverer import render_recovery
 from sq_perception.recovery.recovery import timed
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
-ARRIVAL = Duration(seconds=0.5)
-"""Seconds that the last markers may take to arrive before their publisher is destroyed."""
 
 
 class Outputs:
@@ -78,7 +76,7 @@ class Outputs:
         """Destroy the publishers and delete the markers; planners keep their objects."""
         if self._publishers:
             self.hide()
-            self.markers.wait_for_all_acked(ARRIVAL)
+            self.markers.wait_for_all_acked(Duration(seconds=0.5))  # before the publisher is destroyed
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
         self._publishers = ()

@@ -61,8 +61,6 @@ __all__ = [
     "render_recovery",
 ]
 
-_DOUBT = 0.1
-"""Probability that two objects are one, from which on it counts."""
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
@@ -70,17 +68,7 @@ Network: TypeAlias = inference.Predictor | inference.ThingPredictor
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The objects of one image.
-
-    Attributes
-    ----------
-    segmentation
-        What they were found by.
-    depth : float32 (height, width)
-        The image without readings of objects that are out of range.
-    objects
-        The one with most pixels first.
-    """
+    """The objects of one image, the one with most pixels first; ``depth`` lacks readings of those out of range."""
 
     segmentation: FrameEvidence
     depth: np.ndarray
@@ -260,7 +248,7 @@ class Recoverer:
         fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), objects)
         for k, obj in enumerate(objects):
             same = found.segmentation.affinities(obj.label)
-            others = [(q, other) for other in found.objects if (q := same.get(other.label, 0.0)) > _DOUBT]
+            others = [(q, other) for other in found.objects if (q := same.get(other.label, 0.0)) > 0.1]
             fits[k] = methods.widen(fits[k], others)
         return objects, fits, self._find_parts(objects, fits, depth, readings, deadline)
 
