@@ -51,11 +51,7 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
 
 
 def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
-    """The surface fit, with the prediction if there is one: as a start, and as what is expected of the body where the
-    image leaves it open, such as the depth of a box seen face-on.
-
-    A prediction may be computed only when the fit asks for it, which it need not do for images without noise.
-    """
+    """The surface fit, with the prediction, if there is one, as a start and where the image leaves the body open."""
     # As much of the image as the fit looks at, and more.
     _, near, mask, view = surroundings(obj, depth, obj.mask, camera, max(obj.mask_crop.shape) + BAND_PIXELS)
     if obj.prediction is None:

@@ -122,9 +122,13 @@ class Search:
 
     def next_pieces(self) -> list[SeenObject]:
         """Return the pieces of the next division that have no body yet; none where the search has ended."""
+
+        def alike(one: SeenObject, other: SeenObject) -> bool:
+            return bool(np.sum(one.mask & other.mask) > 0.9 * np.sum(one.mask | other.mask))
+
         while self._divisions:
             for pieces in self._divisions[0]:
-                known = [(piece, [fit for other, fit in self._fitted if _is_same(piece, other)]) for piece in pieces]
+                known = [(piece, [fit for other, fit in self._fitted if alike(piece, other)]) for piece in pieces]
                 self._fresh = [piece for piece, fits in known if not fits]
                 self._again = [fits[0] for _, fits in known if fits]
                 if self._fresh:
@@ -149,11 +153,6 @@ class Search:
                     del self._divisions[1:]
                 return
         self._divisions.pop(0)
-
-
-def _is_same(one: SeenObject, other: SeenObject) -> bool:
-    """Whether the pixels of two pieces are alike enough that they have one body."""
-    return bool(np.sum(one.mask & other.mask) > 0.9 * np.sum(one.mask | other.mask))
 
 
 def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:

@@ -236,30 +236,20 @@ def predict_hulls(
     below = np.stack([np.zeros(4) if plane is None else view.plane_to_canonical(plane) for view, plane in known])
     extents = np.array([view.extent for view in views])
     found = network.predict(shown, below, extents, mirror)
-    return _answered(views, lambda: found)
+    return [Prediction(view, lambda: found, k) for k, view in enumerate(views)]
 
 
 def predict_bodies(views: Sequence[CanonicalView], network: Predictor, when_asked: bool) -> list[Prediction]:
     """Predictions of bodies from views: computed now, or all of them when the first one is asked for."""
     shown = np.stack([view.marked for view in views])
-    if when_asked:
-        return _answered(views, _once(lambda: network.predict(shown)))
-    found = network.predict(shown)
-    return _answered(views, lambda: found)
+    lock, found = threading.Lock(), list[Superquadric]()
 
-
-def _once(compute: Callable[[], Answers]) -> Callable[[], Answers]:
-    """A function that computes its answer in the first thread that asks; others wait for it."""
-    lock, found = threading.Lock(), list[Answers]()
-
-    def answers() -> Answers:
-        with lock:
+    def answers() -> Superquadric:
+        with lock:  # of several threads that ask, one computes
             if not found:
-                found.append(compute())
+                found.append(network.predict(shown))
             return found[0]
 
-    return answers
-
-
-def _answered(views: Sequence[CanonicalView], answers: Callable[[], Answers]) -> list[Prediction]:
+    if not when_asked:
+        answers()
     return [Prediction(view, answers, k) for k, view in enumerate(views)]
