@@ -266,10 +266,7 @@ def _keep(state: TrainingState, config: Run, task: Task, record: dict[str, Any])
 
 
 def mixed_precision(device: str, wanted: bool) -> torch.autocast:
-    """Within it a network computes in bfloat16, where that is wanted and the device has such products.
-
-    A processor without them takes 16 times as long for a step in it as in float32, one with them half as long.
-    """
+    """Within it a network computes in bfloat16, where that is wanted and the device has such products."""
     has_products = device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     return torch.autocast(device, torch.bfloat16, enabled=wanted and has_products)
 
@@ -278,9 +275,7 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
 def threads(count: int) -> Iterator[None]:
     """So many threads for a network and for the rendering of its views; 0 leaves both their own choice.
 
-    Each has a pool of its own, and OpenMP's threads wait by spinning.  Beside other work on all cores, a renderer's
-    second thread, which got its turn late and held a core while it had nothing to do, made a run of one torch thread
-    more than seven times as slow.
+    Each has a pool of its own, whose threads wait by spinning: beside other work a second one makes both much slower.
     """
     before = torch.get_num_threads(), numba.get_num_threads()
     if count:

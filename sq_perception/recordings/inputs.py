@@ -2,10 +2,9 @@
 
 A folder gives its frames and bags in natural order (frame_2 before frame_10), by their times where all names are times,
 NPYs only where it has nothing else, as matrices of calibrations are such files too; one without any gives those of its
-subfolders, down to four levels, or of the one called depth.  The camera of its images, and of an image that is named
-by itself, is one of ``camera_file.CAMERA_FILES`` beside it or in the folder that was named, else the YAML of its own
-name.
-What cannot be read comes as an error with the reason, in its place, and the rest follows.
+subfolders, down to four levels, or of the one called depth.  The camera of an image is one of
+``camera_file.CAMERA_FILES`` beside it or in the folder that was named, else the YAML of its own name.  What cannot be
+read comes as an error with the reason, in its place.
 
 Bodies get ids by a tracking session over each sequence, a topic of a bag or the frames of one folder, of a camera that
 stands still.  Frames without a stamp are taken to be INTERVAL apart.  With camera poses all frames show one scene that

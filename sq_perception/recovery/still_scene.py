@@ -1,9 +1,8 @@
 """Objects that did not change since the frame before: readings in them and around them differ by no more than noise.
 
-A body is what a fit makes of readings.  Where these differ by noise alone, another fit would differ by what that noise
-makes of it, which is its covariance.  So the body of the frame before stands, without another segmentation, prediction
-or fit.  It is not refined either: its error is that of the frame it was recovered from, and counts once
-(:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
+Where readings differ by noise alone, another fit would differ by its covariance.  So the body of the frame before
+stands, without another segmentation, prediction or fit; its error is that of the frame it was recovered from, and
+counts once (:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
 
     scene = StillScene(recoverer)
     for depth in video:
@@ -22,10 +21,9 @@ noise that neighbouring pixels share.  What turned, slid, or has another shape m
 frame repeat if its objects do and nowhere, over a patch as small as an object, does q change, or reading appear that
 does not go on with one beside it.
 
-Because readings are compared with those at the recovery, slow motion adds up until it is noticed.  And because the test
-may miss what lies below the noise, and a valley of the fit's cost may have been a wrong one, one body at a time is
-recovered anew when its turn comes, sooner where the view does not determine all of it: in the segment that it had, or,
-as that may have been wrong as well, in segments that are found anew where the old ones are old.
+Because readings are compared with those at the recovery, slow motion adds up until it is noticed.  Because the test may
+miss what lies below the noise, and a fit may have been wrong, one body at a time is recovered anew when its turn comes,
+sooner where the view does not determine all of it; old segments are then found anew, too.
 
 The camera has not moved: where it has, nothing repeats.  Optical frame, metres; pinhole cameras.
 

@@ -1,10 +1,8 @@
 """Recover frames in several processes and return the results in order; and many images of one object each.
 
-Each process has a Recoverer with one thread.  A few frames per process are under way at a time, which bounds memory.
-If a process dies (killed, or out of memory), another one starts and its frame is tried again, a few times.
-
-Each process has a pipe of its own.  Those of :class:`concurrent.futures.ProcessPoolExecutor` share one: a process that
-is killed while it writes an answer leaves all the others, and their caller, waiting for ever.
+Each process has a Recoverer with one thread, and a few frames under way, which bounds memory.  If a process dies
+(killed, or out of memory), another one starts and its frame is tried again, a few times.  Each has a pipe of its own:
+those of :class:`concurrent.futures.ProcessPoolExecutor` share one, and wait for ever if one is killed while it writes.
 """
 
 from __future__ import annotations

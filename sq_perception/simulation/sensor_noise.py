@@ -214,7 +214,7 @@ class StructuredLight(Triangulation):
         sigma = 0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) theta^2 / (pi/2 - theta)^2,
 
     and edges that wander by edge_wander + 0.035 theta / (pi/2 - theta) pixels.  They use the last term of sigma beyond
-    60 degrees only, where it is 0.4 mm at 1 m; here it holds everywhere, so that nothing jumps.
+    60 degrees only.
     """
 
     def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray:

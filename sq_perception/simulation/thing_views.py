@@ -1,8 +1,6 @@
 """Canonical views of household objects as cameras see them, with the support function of their hulls: training data.
 
-Each view is what :func:`canonical_view.from_mask` makes of a small pinhole image of the object on its table, after a
-sensor measured it: what a network is trained on is made by the code that it will be used with.  The image is drawn as
-follows.
+Each view is what :func:`canonical_view.from_mask` makes of a small pinhole image of the object on its table:
 
     setting     pose, camera and what is around the object: :mod:`sq_perception.simulation.thing_setting`
     before it   in some images something nearer, which comes in from one side
