@@ -50,8 +50,7 @@ class Calibration:
     """What is known of the camera of an image; :meth:`of` makes one from a camera_info."""
 
     camera: Camera  # the pinhole camera of the rectified images
-    rectification: Rectification | None = None
-    """From raw images to those of ``camera``; None where they are sent rectified."""
+    rectification: Rectification | None = None  # from raw images to those of camera; None where they are sent rectified
     note: str = ""
     """What auto has decided about distortion coefficients that are there, and how to change that; empty if it had
     nothing to decide."""

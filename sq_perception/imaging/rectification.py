@@ -96,11 +96,9 @@ class Lookup:
 
     source: Camera  # camera of the images that are looked up in; others raise ValueError
     u: np.ndarray
-    v: np.ndarray
-    """float32 (height, width), column u and row v in the source, far outside of it where it sees nothing."""
+    v: np.ndarray  # float32 (height, width), column u and row v in the source, far outside of it where it sees nothing
     left: np.ndarray
-    top: np.ndarray
-    """float32 (height, width), column and row of the upper left one of the four neighbours."""
+    top: np.ndarray  # float32 (height, width), column and row of the upper left one of the four neighbours
     close: np.ndarray  # uint8 (height, width), 1 where the place is as good as that of the nearest pixel
     step: float  # relative difference of depths beyond which neighbours show different surfaces
 

@@ -66,8 +66,7 @@ class HullPredictions:
     """What the network of things predicts for a batch of views, each in the frame of its view; NumPy."""
 
     bodies: Superquadric  # batch (n,)
-    support: np.ndarray
-    """(n, J), support functions in sides of the view, from c of :mod:`sq_perception.learning.networks`."""
+    support: np.ndarray  # (n, J), support functions in sides of the view, from c of sq_perception.learning.networks
     covariance: np.ndarray  # (n, J, J), scale of their errors
     freedom: float  # nu
 

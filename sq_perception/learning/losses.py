@@ -154,15 +154,11 @@ class Objective:
     """A loss and its settings; see the module.  Raises ValueError for another name."""
 
     name: str = "occupancy"
-    points: int = 256
-    """Comparison points a body: half close around it, half in twice its box."""
+    points: int = 256  # comparison points a body: half close around it, half in twice its box
     sharpness_start: float = 0.0
-    sharpness_end: float = 0.0
-    """s at the start and the end of the run; 0 takes the values of the table."""
-    framing: str = "cropped"
-    """Framing of the views."""
-    stride: int = 2
-    """Every ``stride``-th row and column of the view is a line of sight."""
+    sharpness_end: float = 0.0  # s at the start and the end of the run; 0 takes the values of the table
+    framing: str = "cropped"  # framing of the views
+    stride: int = 2  # every stride-th row and column of the view is a line of sight
 
     def __post_init__(self) -> None:
         if self.name not in LOSSES:

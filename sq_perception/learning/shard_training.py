@@ -69,18 +69,13 @@ between two validations."""
 class NetworkKind:
     """What is particular to a network that is trained on shards of views, a dataclass of arrays (n, ...)."""
 
-    name: str
-    """Name of its file of weights and of its command, ``train-NAME``."""
-    none: Any
-    """No views at all, in the form of all."""
-    network: Callable[[str], Any]
-    """A network to begin with, from the weights that :attr:`ShardTraining.start` names."""
+    name: str  # name of its file of weights and of its command, train-NAME
+    none: Any  # no views at all, in the form of all
+    network: Callable[[str], Any]  # a network to begin with, from the weights that ShardTraining.start names
     batch: Callable[[Any, np.ndarray, np.random.Generator], tuple[np.ndarray, ...]]
     """What the network takes of the views of these numbers, varied at random, and last the truth about them."""
-    loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]
-    """As :attr:`Task.loss`."""
-    validate: Callable[[Any, Any], dict[str, Any]]
-    """Figures of the network on views."""
+    loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]  # as Task.loss
+    validate: Callable[[Any, Any], dict[str, Any]]  # figures of the network on views
     finish: Callable[..., None] = lambda network, views: None
     """Changes a network when its training ends, by views that it was not trained on: errors on the others are smaller,
     by a seventh after 8 million views of 700 000."""

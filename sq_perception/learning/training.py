@@ -44,18 +44,14 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
 class Task:
     """What is particular to the training of one network."""
 
-    command: str
-    """The command that runs it."""
-    newest: str
-    """Name of the file of weights that each validation replaces."""
+    command: str  # the command that runs it
+    newest: str  # name of the file of weights that each validation replaces
     batch: Callable[[], tuple[tuple[torch.Tensor, ...], Any]]
     """What the network takes of a batch, and the truth about it, on the run's device."""
     loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]
     """Loss of the network's output for what it took, the truth, and the share of the run that is done."""
-    validate: Callable[[Any], dict[str, Any]]
-    """Figures of a network on views that it is not trained on."""
-    finish: Callable[[Any], None] = lambda network: None
-    """Changes a network when its training ends."""
+    validate: Callable[[Any], dict[str, Any]]  # figures of a network on views that it is not trained on
+    finish: Callable[[Any], None] = lambda network: None  # changes a network when its training ends
     score: Callable[[dict[str, Any]], tuple[float, float]] | None = None
     """What of the figures the best network, kept as model.safetensors, has most of, and the loss of a plateau."""
 
@@ -70,16 +66,12 @@ class TrainingState:
     path: Path
     model: Any
     optimizer: torch.optim.Optimizer
-    settings: str = ""
-    """What the run is made of, JSON."""
+    settings: str = ""  # what the run is made of, JSON
     average: Any = field(init=False)
     plateau: Plateau = field(default_factory=Plateau)
-    step: int = 0
-    """Steps done."""
-    seconds: float = 0.0
-    """Time spent, in all parts of the run."""
-    best: float = -math.inf
-    """Best validation so far."""
+    step: int = 0  # steps done
+    seconds: float = 0.0  # time spent, in all parts of the run
+    best: float = -math.inf  # best validation so far
     held: list[str] = field(default_factory=list)
     """Names of the files of views that are kept for validation, where a run has such."""
 

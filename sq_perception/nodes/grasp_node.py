@@ -97,14 +97,12 @@ class GraspNode(ManagedNode):
         self._settings = LiveParameters(self, GraspParameters)
         self._last: PointCloud2 | None = None
         self._heard_at = monotonic()
-        self._arrival = 0.0
-        """Its arrival, seconds of the node's clock."""
+        self._arrival = 0.0  # its arrival, seconds of the node's clock
         self._plane: PoseStamped | None = None
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
         self._array: Publisher | None = None
-        self._publishing = threading.Lock()
-        """Held while publishing, or while publishing ends."""
+        self._publishing = threading.Lock()  # held while publishing, or while publishing ends
         self._clouds: Listener | None = None
         self._planes: Any = None
         self.create_service(Trigger, "~/plan", self._on_plan)

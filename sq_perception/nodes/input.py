@@ -70,20 +70,16 @@ class Input:
     ) -> None:
         self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
         transport = settings.current.image_transport
-        self.topic = frames.image_topic(node, transport)
-        """Topic of the depth images."""
+        self.topic = frames.image_topic(node, transport)  # topic of the depth images
         self._note = ""
         self._numbers_note: tuple[str, ...] = ()
         self._last_image = monotonic()
-        self._changed = threading.Condition()
-        """Guards the following attributes."""
+        self._changed = threading.Condition()  # guards the following attributes
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=16)
-        self._image_stamp = -1
-        """Stamp of the last image."""
-        self._are_paired = False
-        """Whether an image has had a camera_info of its own stamp."""
+        self._image_stamp = -1  # stamp of the last image
+        self._are_paired = False  # whether an image has had a camera_info of its own stamp
         self._masks: OrderedDict[int, MaskMessage] = OrderedDict()
         self._is_closed = False
         # Subscriptions are served in this order: what an image needs is there before the image.

@@ -82,10 +82,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         # seconds that a model takes to load, and raises RCLError for one that the state does not allow, which ends it.
         (service,) = (each for each in self.services if each.srv_type is ChangeState)
         service.callback = self._on_change_state  # type: ignore[assignment]  # executors await it
-        self.fault = ""
-        """Why the last transition failed; empty once one has succeeded."""
-        self.start_failure = ""
-        """Why the node could not start itself; its process then ends."""
+        self.fault = ""  # why the last transition failed; empty once one has succeeded
+        self.start_failure = ""  # why the node could not start itself; its process then ends
         self._starts_itself = False
         self._closing = threading.Event()
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()

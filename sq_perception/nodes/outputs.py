@@ -55,8 +55,7 @@ class Outputs:
         self._node = node
         self.optional = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
-        self._header: Any = None
-        """Header of the markers that are shown, if there are any."""
+        self._header: Any = None  # header of the markers that are shown, if there are any
 
     def open(self, parameters: RecoverParameters) -> None:
         """Create the publishers."""
@@ -155,8 +154,7 @@ class OptionalOutputs:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._publishers: dict[str, Publisher] = {}
-        self.absent: dict[str, str] = {}
-        """Missing packages by output; replaced as a whole, for other threads."""
+        self.absent: dict[str, str] = {}  # missing packages by output; replaced as a whole, for other threads
         self._scene = collision_objects.Scene()
         self._planner_came = threading.Event()
         self._all_due = 0.0

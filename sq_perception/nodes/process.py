@@ -43,8 +43,7 @@ REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation
 class Stoppable(Protocol):
     """An rclpy node that may fail to start, and must be stopped before it is destroyed."""
 
-    start_failure: str
-    """Why the node cannot start, once known; its process then ends."""
+    start_failure: str  # why the node cannot start, once known; its process then ends
 
     def close(self) -> bool:
         """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""

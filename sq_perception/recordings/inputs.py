@@ -64,8 +64,7 @@ class RecordedInput:
             treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
             camera_file.read_calibration(self._options.camera_info, treatment, size=ANY_SIZE)
         self._sources = [source for name in names for source in self._name(name)]
-        self.total = len(self._sources)
-        """Frames to expect; a bag counts as one until it is opened."""
+        self.total = len(self._sources)  # frames to expect; a bag counts as one until it is opened
 
     @property
     def files(self) -> list[Path]:

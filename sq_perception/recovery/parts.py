@@ -103,8 +103,7 @@ class Search:
 
     def __init__(self, obj: SeenObject, alone: Fit, depth: np.ndarray, camera: Camera) -> None:
         self._noise = alone.noise
-        self.parts: Parts | None = None
-        """The best ones so far; None where one body is the shorter description."""
+        self.parts: Parts | None = None  # the best ones so far; None where one body is the shorter description
         self._divisions: list[Iterator[list[SeenObject]]] = []
         self._fitted: list[tuple[SeenObject, Fit]] = []
         self._fresh: list[SeenObject] = []

@@ -133,8 +133,7 @@ class Triangulation(SensorNoise):
     far: float  # metres; readings nearer or farther are missing
     edge_wander: float  # pixels, standard deviation of the place of an edge, in both directions, at normal incidence
     grazing: float
-    blind: float
-    """Degrees of incidence up to which (grazing) no reading is lost, and from which on (blind) all are."""
+    blind: float  # degrees of incidence up to which (grazing) no reading is lost, and from which on (blind) all are
 
     def __post_init__(self) -> None:
         check(self, focal=(1e-3, np.inf), baseline=(-np.inf, np.inf), step=(0.0, np.inf), near=(1e-3, np.inf))
