@@ -208,11 +208,11 @@ def known() -> str:
 
 
 def public() -> str:
-    """Things of known size in frames of public repositories, by kind."""
+    """Things of known size in frames of public repositories: all, and kinds of four and more."""
     groups = results("public_frames")["groups"]
     rows = []
     for title, one in groups.items():
-        if not title.startswith("sensor"):
+        if not title.startswith("sensor") and one["things"] >= 4:
             known = f"{one['edges median']:.1f} / {one['edges mean']:.1f}"
             shares = "-" if one["within 2"] is None else f"{one['within 2']:.0f} / {one['beyond 3']:.0f}"
             iou = "-" if one["iou"] is None else f"{one['iou']:.1f} ({one['posed']})"
