@@ -10,8 +10,7 @@ A consumer gets each body in the optical frame of its frame and in the form that
 | wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
 
 So a body that a hand moves is published no farther from where the frame shows it than four deviations of that one
-observation, and nothing is published that the frame does not show.  A single observation of other sizes in the same
-place is taken for an error and left out.
+observation.  A single observation of other sizes in the same place is taken for an error and left out.
 
 Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
 FIRST_FAILED_ID + its label, which no track reaches.
