@@ -140,11 +140,9 @@ class RecordedInput:
 
 def in_folder(folder: Path) -> list[Path]:
     """Return the frames and bags in a folder: by their times where all names are times, else in natural order."""
-
-    def is_frame(path: Path) -> bool:
-        return path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir()  # a broken link is reported
-
-    found = sorted((path for path in folder.iterdir() if is_frame(path) or bag_file.is_bag(path)), key=_natural)
+    within = sorted(folder.iterdir(), key=_natural)
+    is_frame = [path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir() for path in within]  # or a broken link
+    found = [path for path, wanted in zip(within, is_frame, strict=True) if wanted or bag_file.is_bag(path)]
     found = [path for path in found if path.suffix.lower() != ".npy"] or found
     times = {path: stamp for path in found if (stamp := frame_file.stamp_of(path))}
     return found if len(times) < len(found) else sorted(found, key=times.__getitem__)
