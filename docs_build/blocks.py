@@ -72,14 +72,8 @@ def accuracy() -> str:
 def household() -> str:
     """Household things on a table through simulated sensors, at least half visible."""
     found = results("real_scenes")
-    names = {
-        "given": "`auto`, given masks",
-        "own": "`auto`, own masks",
-        "classic": "`classic`, given masks",
-        "oriented box": "smallest box of the visible points, given masks",
-    }
     rows = []
-    for name, text in names.items():
+    for name, text in (("given", "`auto`, given masks"), ("own", "`auto`, own masks"), ("classic", "`classic`, given")):
         row = found[f"all, at least half visible: {name}"]
         error, within = row["edge_error"], row["within_2_sigma"]
         sigma = "" if within is None else f"{within:.0f}"
