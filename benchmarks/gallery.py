@@ -151,8 +151,7 @@ Simulated [sensors](sensors.md), own masks, default options: `python benchmarks/
 [Figures over many scenes](../README.md#accuracy-and-speed).
 
 Left: depth, black has no reading. Middle: masks and outlines. Right: bodies, true objects as thin lines. Edges are full
-lengths ± one sigma; IoU is with the true convex hull. Unless noted, all objects are found, and
-nothing else.
+lengths ± one sigma; IoU is with the true convex hull. Unless noted, all objects are found, and nothing else.
 """
 
 

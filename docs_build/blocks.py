@@ -140,7 +140,7 @@ def latency() -> str:
     for name, text in names.items():
         case = results("node_latency")["cases"][name]
         times = " / ".join(f"{case['milliseconds'][part]:.1f}" for part in ("median", "p95", "max"))
-        rows.append(f"{text} | {times}  | {case['results_per_second']:.1f}")
+        rows.append(f"{text} | {times} | {case['results_per_second']:.1f}")
     return table("frame | ms median / p95 / max | results / s", rows)
 
 
@@ -151,8 +151,8 @@ def cameras() -> str:
     for masks in ("given", "own"):
         one, two = found[f"{masks}, one"], found[f"{masks}, two"]
         edges = ", ".join(f"{1e3 * row['edge']:.1f} / {1e3 * row['median_edge']:.1f}" for row in (one, two))
-        shares = (f"{100 * one[key]:.0f}, {100 * two[key]:.0f}" for key in ("weak", "iou", "covered"))
-        rows.append(" | ".join((masks, edges, *shares)))
+        weak, covered = (f"{100 * one[key]:.0f}, {100 * two[key]:.0f}" for key in ("weak", "covered"))
+        rows.append(f"{masks} | {edges} | {weak} | {100 * one['iou']:.1f}, {100 * two['iou']:.1f} | {covered}")
     return table(f"masks | edge error mm, mean / median | weak % | IoU % | {SIGMAS}", rows)
 
 
