@@ -150,9 +150,8 @@ INTRODUCTION = """
 Simulated [sensors](sensors.md), own masks, default options: `python benchmarks/gallery.py` ({facts}).
 [Figures over many scenes](../README.md#accuracy-and-speed).
 
-Left: depth, near is light, black has no reading. Middle: masks and outlines. Right: bodies, true objects as thin lines.
-Edges are full lengths ± one sigma; IoU is with the true convex hull. Unless noted, every object is found
-and nothing else.
+Left: depth, black has no reading. Middle: masks and outlines. Right: bodies, true objects as thin lines. Edges are full
+lengths ± one sigma; IoU is with the true convex hull. Unless noted, all objects are found, and nothing else.
 """
 
 

@@ -18,10 +18,6 @@ from sq_msgs_py.message_types import MessageTypes, find_type
 if TYPE_CHECKING:
     from visualization_msgs.msg import MarkerArray
 
-_LINE_LIST, _TRIANGLE_LIST = 5, 11
-_ADD, _DELETE_ALL = 0, 3
-"""Constants of visualization_msgs/Marker."""
-
 Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices (k, 3), faces (m, 3) of vertex indices, outline (j, 2, 3) of line segments."""
 
@@ -72,23 +68,23 @@ def markers(
     def marker(kind: str, number: int, shape: int, colour: np.ndarray, scale: Any, points: list[Any]) -> Any:
         red, green, blue, opacity = (float(channel) for channel in colour)
         return make_marker(
-            header=header, ns=f"{namespace}/{kind}", id=number, type=shape, action=_ADD, pose=nowhere, scale=scale,
+            header=header, ns=f"{namespace}/{kind}", id=number, type=shape, pose=nowhere, scale=scale,
             color=types("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity), points=points,
         )
 
     as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=0.002)
     black = np.array([0.05, 0.05, 0.05, 1.0])
-    found = [make_marker(header=header, action=_DELETE_ALL)]
+    found = [make_marker(header=header, action=3)]  # DELETEALL; the others' 0 is ADD
     for number, (surface_vertices, surface_faces, outline), colour in zip(ids, meshes, paint, strict=True):
         vertices, faces = check_mesh(surface_vertices, surface_faces)
         corners = [point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
-        found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
+        found.append(marker("surface", number, 11, colour, as_it_is, surface))  # TRIANGLE_LIST
         segments = np.asarray(outline, dtype=float)
         if segments.size and (segments.ndim != 3 or segments.shape[1:] != (2, 3)):
             raise ValueError(f"outline: expected segments (j, 2, 3), got {segments.shape}")
         lines = [point(x=x, y=y, z=z) for x, y, z in segments.reshape(-1, 3).tolist()]
-        found.append(marker("outline", number, _LINE_LIST, black, as_wide, lines))
+        found.append(marker("outline", number, 5, black, as_wide, lines))  # LINE_LIST
     return types("visualization_msgs/msg/MarkerArray")(markers=found)
 
 

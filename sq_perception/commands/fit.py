@@ -75,6 +75,7 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
     from sq_perception.fitting.decomposition import decompose
     from sq_perception.fitting.fit import Fit, Parts
     from sq_perception.fitting.points import fit_points, surface_of
+    from sq_perception.recordings.result_json import plain_values
 
     points, normals = surface_of(surface)
     whole: Parts | Fit
@@ -89,9 +90,7 @@ def _fit(name: str, surface: Any, options: argparse.Namespace) -> dict[str, Any]
         "noise": whole.noise, "ms": round(whole.milliseconds, 3),
         "superquadrics": [_entry(fit, share) for fit, share in zip(fits, shares, strict=True)],
     }
-    # Plain numbers and lists for those of NumPy, and null for NaN and infinity, which JSON does not know.
-    plain: dict[str, Any] = json.loads(json.dumps(entry, default=lambda it: it.tolist()), parse_constant=lambda _: None)
-    return plain
+    return plain_values(entry)
 
 
 def _entry(fit: Any, share: float) -> dict[str, Any]:

@@ -76,8 +76,7 @@ class Outputs:
         self._options = options
         self.results: list[dict[str, Any]] = []
         self.scene: list[dict[str, Any]] = []
-        self._not_in_bag: list[str] = []
-        """Why frames are not in the bag."""
+        self._not_in_bag: list[str] = []  # why frames are not in the bag
         self._bag: ResultBag | None = None
         self._page: HtmlPage | None = None
         self._lines = _lines(options)

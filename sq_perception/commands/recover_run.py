@@ -51,7 +51,10 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
                 place = place_as_text(part["translation"], False)
                 yield f"    part {part['share']:.0%} {part['status']} {edges} at {place}"
             if verbose:
-                yield "    " + _details(body)
+                exponents = " ".join(f"{value:.2f}" for value in body["shape"])
+                seen = " ".join("?" if share is None else f"{share:.0%}" for share in body["seen"])
+                facts = f"exponents {exponents}, score {body['score']:.3f}, seen {seen}, pixels {body['pixels']}"
+                yield f"    {facts}: {body['message']}"
             elif body["status"] != "converged":
                 reason = re.sub(" along [xyz]( and [xyz])*", "", body["message"].partition(";")[0])
                 reasons[body["status"], reason] += 1
@@ -84,13 +87,6 @@ def _line(number: int, body: Mapping[str, Any], is_cube: bool) -> str:
 
 def _sigmas(body: Mapping[str, Any]) -> list[float]:
     return [math.nan if value is None else value for value in body["sigma_size"]]
-
-
-def _details(body: Mapping[str, Any]) -> str:
-    exponents = " ".join(f"{value:.2f}" for value in body["shape"])
-    seen = " ".join("?" if share is None else f"{share:.0%}" for share in body["seen"])
-    facts = f"exponents {exponents}, score {body['score']:.3f}, seen {seen}, pixels {body['pixels']}"
-    return f"{facts}: {body['message']}"
 
 
 def run(options: argparse.Namespace) -> int:

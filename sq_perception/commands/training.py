@@ -87,7 +87,7 @@ Shard k depends only on the seed and k; existing shards are kept.  Several proce
 --first; a training reads what it finds.
 """
 _TRAIN = """\
-Train the network that {what}, on {views} (or still writes).
+Train the network that {what} (or still writes).
 
 The same command continues a stopped run.  The output folder holds the state, a log, and the newest network,
 {weights}.
@@ -147,27 +147,11 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
         return _end_of(name, lambda: write_views(given.folder, shards, drawing(), given.seed))
 
 
-def train_things(arguments: Sequence[str]) -> int:
-    """Run ``sq-perception train-things``; return the exit code."""
-    text = _TRAIN.format(
-        what="predicts the unseen side of objects", views="views that `thing-views` wrote",
-        weights="things.safetensors, which `recover --model` takes",
-    )
-    example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"
-    return _train("things", THING_RUN, text, example, arguments)
-
-
-def train_masks(arguments: Sequence[str]) -> int:
-    """Run ``sq-perception train-masks``; return the exit code."""
-    text = _TRAIN.format(
-        what="finds outliers in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
-    )
-    example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
-    return _train("masks", MASK_RUN, text, example, arguments)
-
-
-def _train(subject: str, run: ShardTraining, text: str, example: str, arguments: Sequence[str]) -> int:
-    """Run one of both commands that train on shards."""
+def _train(
+    subject: str, run: ShardTraining, what: str, weights: str, example: str, arguments: Sequence[str]
+) -> int:
+    """Run ``sq-perception train-SUBJECT``; return the exit code."""
+    text, example = _TRAIN.format(what=what, weights=weights), f"sq-perception train-{subject} {example}"
     command = console.parser(f"train-{subject}", text, f"example:\n  {example}")
     command.set_defaults(**asdict(run))
     add = command.add_argument
@@ -189,6 +173,17 @@ def _train(subject: str, run: ShardTraining, text: str, example: str, arguments:
 
     views, output, kind = options.pop("views"), options.pop("output"), getattr(shard_training, subject.upper())
     return _end_of(f"train-{subject}", lambda: shard_training.train(kind, replace(run, **options), views, output))
+
+
+train_things = partial(
+    _train, "things", THING_RUN, "predicts the unseen side of objects, on views that `thing-views` wrote",
+    "things.safetensors, which `recover --model` takes",
+    "sets/things --output runs/things --minutes 120 --start things",
+)
+train_masks = partial(
+    _train, "masks", MASK_RUN, "finds outliers in segments, on those that `segment-views` wrote", "masks.safetensors",
+    "sets/segments --output runs/masks --minutes 60",
+)
 
 
 _EVALUATE_HELP = """\

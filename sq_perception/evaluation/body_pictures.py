@@ -19,9 +19,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 
-_LIGHT = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
-"""Towards the light, in the frame of the picture: from the upper left, in front."""
-
 
 def draw_bodies_3d(
     ax: Axes, bodies: Sequence[Superquadric], points: Sequence[np.ndarray] | None = None,
@@ -103,13 +100,14 @@ def _upright(plane: np.ndarray | None) -> np.ndarray:
 def _shade(
     depth: np.ndarray, index: np.ndarray, bodies: Sequence[Superquadric], shades: Sequence[np.ndarray], camera: Camera
 ) -> np.ndarray:
-    """RGBA float picture (h, w, 4): matt bodies in front of nothing."""
+    """RGBA float picture (h, w, 4): matt bodies in front of nothing, with light from the upper left, in front."""
+    light = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
     picture = np.ones((*depth.shape, 4), dtype=np.float32)
     picture[..., 3] = index >= 0
     for k, body in enumerate(bodies):
         rows, columns = np.nonzero(index == k)
         normals = body.normals(camera.unproject(columns, rows, depth[rows, columns]))
-        diffuse = np.clip(normals @ _LIGHT, 0, 1)
+        diffuse = np.clip(normals @ light, 0, 1)
         facing = np.clip(-normals[:, 2], 0, 1)
         brightness = 0.62 + 0.34 * diffuse + 0.14 * facing
         gloss = 0.22 * diffuse[:, None] ** 6

@@ -39,8 +39,6 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 GOOD_IOU = 0.85
-_CYCLES = np.array([[0.5, 0.5, 0.5, 0.5], [-0.5, -0.5, -0.5, 0.5]])
-"""x to y to z to x, and back."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,8 +76,9 @@ class FiguresOfMerit:
         count = len(truth)
         missing = np.zeros(count, bool) if recovered is None else ~np.asarray(recovered, dtype=bool)
         turns = truth.equivalent_forms().rotation
-        # The 8 and a cyclic exchange of the axes make the 24 rotations of a cube.
-        orders = np.stack([turns, *(quaternions.multiply(turns, cycle + 0 * turns) for cycle in _CYCLES)])
+        # The 8 and a cyclic exchange of the axes, x to y to z to x and back, make the 24 rotations of a cube.
+        cycles = np.array([[0.5, 0.5, 0.5, 0.5], [-0.5, -0.5, -0.5, 0.5]])
+        orders = np.stack([turns, *(quaternions.multiply(turns, cycle + 0 * turns) for cycle in cycles)])
         angles = quaternions.geodesic_angle(np.broadcast_to(prediction.rotation, orders.shape), orders)
 
         def known(values: np.ndarray) -> np.ndarray:

@@ -2,9 +2,8 @@
 
 A superquadric with e1, e2 <= 2 is convex, so the convex hull of surface points is its mesh.  The points are those of
 the parametric form (thesis, equation 3.5) on a uniform grid of angles, which crowds them where the surface bends.  The
-hull is computed at unit size and then stretched by the half sizes: a map that keeps convexity and topology, and spares
-the hull algorithm the nearly flat input of a thin body.  A taper moves the vertices of the mesh, and may leave it not
-quite convex.
+hull is computed at unit size and then stretched by the half sizes, which keeps convexity and spares the hull algorithm
+the nearly flat input of a thin body.  A taper moves the vertices, and may leave the mesh not quite convex.
 
 Metres, in the frame that the body is given in.
 """

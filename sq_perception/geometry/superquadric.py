@@ -54,8 +54,6 @@ FLAT_LENGTH = NUMBERS - LENGTHS["taper"]
 """Numbers of a body with and without its taper."""
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
-_ENDS = np.array([1.0, -1.0, -1.0, 1.0])
-"""Which of the half turns exchange the ends of a body's z axis, and with them the sign of its taper."""
 _QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
 
 
@@ -415,7 +413,9 @@ class Superquadric:
         largest = np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1)
         q = quaternions.multiply(q, _HALF_TURNS[largest])
         q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
-        taper = np.where(swapped, self.taper[..., ::-1], self.taper) * _ENDS[largest][..., None] + 0.0  # no -0
+        # Half turns about x and y exchange the ends of the z axis, and with them the sign of the taper.
+        ends = np.where((largest == 1) | (largest == 2), -1.0, 1.0)[..., None]
+        taper = np.where(swapped, self.taper[..., ::-1], self.taper) * ends + 0.0  # no -0
         return Superquadric(size, self.shape, self.translation, q, taper)
 
 

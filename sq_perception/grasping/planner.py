@@ -17,12 +17,10 @@ Every margin m_k is a distance or angle to failure, sigma_k its standard deviati
 Vessels without a safe grasp are also tried by their rims (:mod:`sq_perception.grasping.rims`).
 
 The opening is the body's width plus, on either side, a clearance and twice the sigma of that side, limited by the
-gripper.  The hand keeps farther from the less certain side.  Unseen sides are uncertain, so a body of unknown depth is
-gripped by its known sides.  The hand's error is that of its calibration.  The covariance of a fit already contains how
-far real objects deviate from superquadrics.  Where the image shows that the place of a pad, or of the palm between
-the fingers, is empty, there is no body: sides and near end count by the hidden share of that place, and the distance
-of measured points covers the rest.  Margins are treated as independent, except that of measured points: these belong
-to the bodies, so only what it adds to opening, palm and other bodies counts.
+gripper.  The hand keeps farther from the less certain side; a body of unknown depth is gripped by its known sides.
+Where the image shows that the place of a pad, or of the palm between the fingers, is empty, there is no body: sides and
+near end count by the hidden share of that place, and the distance of measured points covers the rest.  Margins are
+treated as independent, except that of measured points: only what it adds to opening, palm and other bodies counts.
 
 Metres, newtons, kilograms; the pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame
 of the bodies.

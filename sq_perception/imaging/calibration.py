@@ -13,9 +13,8 @@ are what is left between ``/``, ``_`` and other marks.  The transport's own part
 ``image_rect``, ``image_rect_raw``, ``depth/rect/image`` and ``depth_registered/image_rect`` are rectified,
 ``image_raw``, ``depth/image`` and ``direct/image`` are not.  A file's name is its folder's and its own.
 
-Depth registered to a colour image is no exception: it has the geometry of that image, and a camera_info that describes
-it.  ``aligned_depth_to_color/image_raw`` and ``depth_to_rgb/image_raw`` are as distorted as their raw colour image,
-whose D they come with; ``depth_registered/image_rect`` lies on the rectified one.
+Depth registered to a colour image has the geometry and the D of that image: ``aligned_depth_to_color/image_raw`` is as
+distorted as the raw colour image, ``depth_registered/image_rect`` lies on the rectified one.
 
 A rectified image has the intrinsics of P, or of K where P is not set; a raw one those of K, whatever P is, and is
 rectified here (:mod:`sq_perception.imaging.rectification`).
@@ -51,8 +50,7 @@ class Calibration:
     """What is known of the camera of an image; :meth:`of` makes one from a camera_info."""
 
     camera: Camera  # the pinhole camera of the rectified images
-    rectification: Rectification | None = None
-    """From raw images to those of ``camera``; None where they are sent rectified."""
+    rectification: Rectification | None = None  # from raw images to those of camera; None where they are sent rectified
     note: str = ""
     """What auto has decided about distortion coefficients that are there, and how to change that; empty if it had
     nothing to decide."""

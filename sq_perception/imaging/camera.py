@@ -24,8 +24,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 Projection = Literal["pinhole", "orthographic"]
-LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
-"""Median depths, metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
 LEAST_DEPTH, GREATEST_DEPTH = 1e-4, 1e5
 """Depths, metres; no sensor measures beyond, and squares and products of numbers beyond are no numbers."""
 

@@ -13,8 +13,7 @@ A PNG can unpack to a thousand times its own length; its size is therefore read 
 RVL is a sequence of runs: how many zeros, how many other pixels, then each of these as its difference to the last pixel
 that was not zero, with the sign in the lowest bit (0 -1 1 -2 2 ... become 0 1 2 3 4 ...).  Every number is written in
 groups of three bits, low groups first; a group is a nibble, whose fourth and highest bit marks that another one
-follows.  Nibbles fill words of 32 bits from the top, and words are little endian.  The numbers are separated all at
-once; only the runs, some thousand in an image, are walked through one by one.
+follows.  Nibbles fill words of 32 bits from the top, and words are little endian.
 
 References: compressed_depth_image_transport, https://github.com/ros-perception/image_transport_plugins; A. D. Wilson,
 Fast lossless depth image compression, ISS 2017.

@@ -11,8 +11,7 @@ The scale is the caller's; else the one that a file or camera states; else 1000 
   10 000 or 100 000, as it stands, or in millimetres), or a tenth of its pixels are holes in surfaces.
 
 So a flat wall, a floor seen from straight above, quantised depths and readings that a sensor clips at its range stay
-what they are: the first two lie around things and not in them, the others have readings just before them.  Orthographic
-grey values never come here.
+what they are: the first two lie around things and not in them, the others have readings just before them.
 
 A Kinect's raw disparities (11 bit, 2047 = nothing) look like millimetres.  They are linear in the pixels of a plane,
 where a depth image has a linear 1/z; an image of them is refused.
@@ -29,7 +28,7 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from sq_perception.imaging.camera import GREATEST_DEPTH, GREATEST_MEDIAN, LEAST_MEDIAN, Camera
+from sq_perception.imaging.camera import GREATEST_DEPTH, Camera
 
 DepthKind = Literal["z", "range"]
 """What a depth image holds: z along the optical axis, or the distance to the camera's centre along each ray."""
@@ -129,10 +128,10 @@ def wrong_unit(depth: np.ndarray) -> str:
     some = depth[::8, ::8]
     some = some[(some > 0) & (some < np.inf)]
     middle = float(np.median(some)) if some.size else 1.0
-    if middle > GREATEST_MEDIAN:
-        found, unit = f"farther than {GREATEST_MEDIAN:g} m", "millimetres the depth scale is 1000"
-    elif middle < LEAST_MEDIAN:
-        found, unit = f"nearer than {LEAST_MEDIAN:g} m", "metres the depth scale is 1"
+    if middle > 100:
+        found, unit = "farther than 100 m", "millimetres the depth scale is 1000"
+    elif middle < 0.01:
+        found, unit = "nearer than 0.01 m", "metres the depth scale is 1"
     else:
         return ""
     return f"half of the image is {found}: for {unit} (--depth-scale of commands, depth_scale of nodes)"

@@ -16,8 +16,7 @@ back and would show the scene a second time, both maps give NaN, as they do for 
 the image plane, which no pinhole image can hold.
 
 The inverse has no closed form.  Newton's method solves for both coordinates at once, from a start that a table of
-r -> r' gives: three to five steps to 1e-15, everywhere.  OpenCV's undistortPoints iterates x <- (x' - tangential) / q
-instead, which converges slowly or not at all where distortion is strong, and does not report it.
+r -> r' gives: three to five steps to 1e-15.  OpenCV's undistortPoints does not converge where distortion is strong.
 
 Reference: OpenCV, Camera Calibration and 3D Reconstruction; J. Kannala and S. Brandt, A generic camera model and
 calibration method for conventional, wide-angle, and fish-eye lenses, PAMI 2006; REP 104.

@@ -7,22 +7,19 @@ and from its inverse for the way back.
 
 The pinhole camera has the focal lengths of K and its pixels on the raw grid, so that the middle of the image stays as
 sharp as it is, and an image without distortion stays what it is.  Its window is as large as all that the raw image
-sees, whether its edges bulge or are drawn in; only a window of more than twice the pixels of the raw image, as a 4:3
-fisheye that sees more than 90 degrees across would need, is cut to that, about the direction that the middle of the raw
-image looks in: 0.6 % of the raw pixels are lost at 90 degrees, 3 % at 100, 15 % at 120.  P is not used: it is the same
-camera with another zoom, chosen for a window that must not change its size.
+sees; only a window of more than twice the pixels of the raw image, as of a fisheye that sees more than 90 degrees
+across, is cut to that, about the middle (of the raw pixels 0.6 % are lost at 90 degrees, 15 % at 120).  P is not used:
+it is the same camera with another zoom, chosen for a window that must not change its size.
 
 Depth between pixels is interpolated in 1/z, in which planes are flat, where the four neighbours show one surface, and
-is nothing elsewhere: so no value lies between two surfaces, where nothing is, and none beside one.  The depth of the
-nearest pixel puts points up to half a pixel outside of outlines, and bodies fitted to exact images came out up to 10 %
-too large; so they are right to 0.6 %.  The price is a rim of half a pixel, and whatever is a single pixel wide.
+is nothing elsewhere: so no value lies between two surfaces, where nothing is, and none beside one.  With the
+depth of the nearest pixel bodies came out up to 10 % too large.  The price is a rim of half a pixel.
 
 Neighbours show one surface if it would be seen at less than 84 degrees, a relative step of 10 / f, as in
 :mod:`sq_perception.imaging.inverse_depth`.  A smaller step may still be the edge of something flat; then a pixel is
-wrong by at most that step.  OpenCV before 5 looks up at 32nds of a pixel, and is off by up to five times as much
-between pixels, some hundredths of a millimetre.  Single pixels without depth inside a surface, and the gaps of a
-perforated image (:mod:`sq_perception.imaging.hole_filling`), are no edge: they are bridged for their neighbours' sake,
-and stay empty.  Labels are those of the nearest pixel.
+wrong by at most that step.  Single pixels without depth inside a surface, and the gaps of a perforated image
+(:mod:`sq_perception.imaging.hole_filling`), are no edge: they are bridged for their neighbours' sake, and stay empty.
+Labels are those of the nearest pixel.
 """
 
 from __future__ import annotations
@@ -99,11 +96,9 @@ class Lookup:
 
     source: Camera  # camera of the images that are looked up in; others raise ValueError
     u: np.ndarray
-    v: np.ndarray
-    """float32 (height, width), column u and row v in the source, far outside of it where it sees nothing."""
+    v: np.ndarray  # float32 (height, width), column u and row v in the source, far outside of it where it sees nothing
     left: np.ndarray
-    top: np.ndarray
-    """float32 (height, width), column and row of the upper left one of the four neighbours."""
+    top: np.ndarray  # float32 (height, width), column and row of the upper left one of the four neighbours
     close: np.ndarray  # uint8 (height, width), 1 where the place is as good as that of the nearest pixel
     step: float  # relative difference of depths beyond which neighbours show different surfaces
 

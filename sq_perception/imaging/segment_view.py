@@ -51,8 +51,7 @@ class SegmentView:
     left: float
     top: float
     side: float
-    height: float
-    """The window, in pixels: its corner, where the image's is (0, 0), its width and its height."""
+    height: float  # the window, in pixels: its corner, where the image's is (0, 0), its width and its height
 
     def of_part(self, cells: np.ndarray) -> np.ndarray:
         """The image as it would be if the segment had these cells alone, bool (PIXELS, PIXELS), and the rest of them

@@ -168,8 +168,7 @@ class _Search:
         # its cells; double precision is asked for by checks of gradients.
         self._halvings = 40 if lines.dtype == torch.float64 else 9
         self._middle = bodies.translation[:, 2:].expand(count)
-        self.reach = bodies.support(toward)
-        """Half the body's extent along z, (n, 1)."""
+        self.reach = bodies.support(toward)  # half the body's extent along z, (n, 1)
 
     def gauge(self, z: torch.Tensor) -> torch.Tensor:
         x, y, z = (torch.abs(o + z * d) for o, d in zip(self._origin, self._direction, strict=True))

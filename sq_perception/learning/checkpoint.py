@@ -6,9 +6,8 @@ The header (strings, as the format demands) holds ``format`` and its version, th
 training noted (``training``, ``metrics``: JSON).  Reading executes nothing, and every name and shape must fit.
 Half precision on disk halves the file; networks compute in single precision.
 
-Weights are taken in as a whole and never mapped: a file that is cut short or replaced while they are read, or
-afterwards, is an error or another network, and no fault of memory that ends the process.  No header makes anything be
-allocated: the file's own length bounds it, and that is looked at first.
+Weights are read as a whole and never mapped: a file that is cut short or replaced meanwhile is an error or another
+network, and no fault of memory that ends the process.  The file's own length bounds what is allocated.
 
 Reference: the safetensors format, https://huggingface.co/docs/safetensors.
 """

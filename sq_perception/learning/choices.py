@@ -13,7 +13,5 @@ Loss = Literal["occupancy", "occupancy_rotation", "dual", "mse", "least_squares"
 LOSSES: tuple[str, ...] = get_args(Loss)
 UNSUPERVISED = ("least_squares", "least_squares_free", "render")
 """Losses that see the view alone, no label."""
-SIZE_RANGE = (0.04, 1.2)
-"""Half sizes that a network for cropped views can express, in sides of the view; the thesis' bodies reach 0.8."""
 NEEDS_TORCH = "needs torch: pip install 'sq_perception[train]'"
 """The remedy where torch is not installed: training, graphics cards, ResNet-18 and the soft renderer need it."""

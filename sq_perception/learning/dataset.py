@@ -40,8 +40,7 @@ POOL = 4096
 class Disturbance:
     """How many of the views are disturbed, and how much."""
 
-    occluded_share: float = 0.0
-    """Share of the views with an occluder."""
+    occluded_share: float = 0.0  # share of the views with an occluder
     noisy_share: float = 0.0
     """Share of the views with noise, steps, holes and wrong edges, each of them in some of those."""
 
@@ -82,8 +81,7 @@ def any_occluder(share: np.ndarray, rng: np.random.Generator) -> Occluder:
 class ViewSource:
     """Which bodies are drawn, and how they are seen."""
 
-    pixels: int = 64
-    """Side of the views."""
+    pixels: int = 64  # side of the views
     pinhole_share: float = 0.0
     """Share of the views that a pinhole camera sees, at 1.5 to 12 times the body's length; the others are
     orthographic, as in the thesis."""
@@ -91,8 +89,7 @@ class ViewSource:
     """Share of the bodies with proportions up to 1 : 6, many of them boxes, cylinders or ellipsoids; the others are
     those of the thesis' protocol."""
     disturbance: Disturbance = field(default_factory=Disturbance)
-    framing: Framing = "cropped"
-    """Canonical views, or full: the whole cube, as in the thesis' images."""
+    framing: Framing = "cropped"  # canonical views, or full: the whole cube, as in the thesis' images
 
 
 def wide_bodies(count: int, rng: np.random.Generator) -> Superquadric:

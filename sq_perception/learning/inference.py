@@ -40,13 +40,7 @@ from sq_perception.geometry.union import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
-from sq_perception.learning.network_config import (
-    MaskConfig,
-    RegressorConfig,
-    ThingConfig,
-    check_views,
-    mirror_planes,
-)
+from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig, check_views, mirror_planes
 
 if TYPE_CHECKING:
     from sq_perception.learning.networks import ThingNetwork
@@ -72,8 +66,7 @@ class HullPredictions:
     """What the network of things predicts for a batch of views, each in the frame of its view; NumPy."""
 
     bodies: Superquadric  # batch (n,)
-    support: np.ndarray
-    """(n, J), support functions in sides of the view, from c of :mod:`sq_perception.learning.networks`."""
+    support: np.ndarray  # (n, J), support functions in sides of the view, from c of sq_perception.learning.networks
     covariance: np.ndarray  # (n, J, J), scale of their errors
     freedom: float  # nu
 
@@ -86,11 +79,8 @@ class HullPredictions:
 
 
 class ThingPredictor:
-    """The network of things, made ready to predict.
-
-    It computes each view and its mirror image, whose prediction is mirrored back: the mean of two support functions
-    errs less than one (by 3 to 6 % on recorded things); the mean of their covariances does not promise more.  The
-    body is that of the view itself.
+    """The network of things, made ready to predict: the means of support functions and covariances of each view and of
+    its mirror image, mirrored back, which err less; the body is that of the view itself.
     """
 
     def __init__(self, network: forward.CompactThings | ThingNetwork) -> None:

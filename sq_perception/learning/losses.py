@@ -44,9 +44,8 @@ Render loss (7.8 to 7.11)
 
     L_DR = mean_lines |X - T|,        T: soft depth at s and tau.
 
-T comes from a grid of n^3 voxels, as in the thesis (:mod:`sq_perception.imaging.soft_render`), or as the limit of ever
-finer voxels with D = n tau held fixed.  The limit is cheap at any s.  That matters: a soft boundary moves the optimum,
-and fitting at s = 20, 40 and 100 (D = 2 s) ends at 83, 90 and 95 % IoU even if it starts from the truth.
+T is the limit of ever finer voxels with D = n tau held fixed (:mod:`sq_perception.imaging.soft_render`), cheap at any
+s.  A soft boundary moves the optimum: fits at s = 20, 40 and 100 (D = 2 s) end at 83, 90 and 95 % IoU.
 
 What a training minimises
 -------------------------
@@ -63,10 +62,9 @@ What a training minimises
 s grows geometrically: a soft boundary is felt from afar, a sharp one has its optimum at the true body.  Losses of the
 view are computed on a random subset of its lines of sight, another one at every step.
 
-Least squares needs a curriculum.  Nothing in L_LS holds what lies behind the silhouette, and the first thing a network
-learns, one body for all images, is a column that runs away from the viewer; few images bring it back.  The factor
-sqrt(a1 a2 a3) is therefore multiplied by (a1 a2 a3 / 0.05)^k, k falling from 1 to 0 over the first four fifths of the
-run, which keep bodies small until the residual determines them; what is minimised in the end is equation 7.7.
+Nothing in L_LS holds what lies behind the silhouette.  The factor sqrt(a1 a2 a3) is therefore multiplied by
+(a1 a2 a3 / 0.05)^k, k falling from 1 to 0 over the first four fifths of the run, which keeps bodies small until the
+residual determines them; what is minimised in the end is equation 7.7.
 """
 
 from __future__ import annotations
@@ -156,15 +154,11 @@ class Objective:
     """A loss and its settings; see the module.  Raises ValueError for another name."""
 
     name: str = "occupancy"
-    points: int = 256
-    """Comparison points a body: half close around it, half in twice its box."""
+    points: int = 256  # comparison points a body: half close around it, half in twice its box
     sharpness_start: float = 0.0
-    sharpness_end: float = 0.0
-    """s at the start and the end of the run; 0 takes the values of the table."""
-    framing: str = "cropped"
-    """Framing of the views."""
-    stride: int = 2
-    """Every ``stride``-th row and column of the view is a line of sight."""
+    sharpness_end: float = 0.0  # s at the start and the end of the run; 0 takes the values of the table
+    framing: str = "cropped"  # framing of the views
+    stride: int = 2  # every stride-th row and column of the view is a line of sight
 
     def __post_init__(self) -> None:
         if self.name not in LOSSES:

@@ -17,7 +17,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning.choices import SIZE_RANGE, Backbone, Framing
+from sq_perception.learning.choices import Backbone, Framing
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -37,22 +37,18 @@ class RegressorConfig:
     empty range.
     """
 
-    pixels: int = 64
-    """Side of the views: a multiple of 32 for resnet18, of 2 to the number of ``widths`` for compact."""
+    pixels: int = 64  # side of the views: a multiple of 32 for resnet18, of 2 to the number of widths for compact
     widths: tuple[int, ...] = (32, 64, 128, 256)
     """For compact: channels of the stem and of each stage; every stage halves the resolution."""
-    blocks: int = 2
-    """For compact: residual blocks a stage."""
+    blocks: int = 2  # for compact: residual blocks a stage
     hidden: int = 256
-    size_range: tuple[float, float] = SIZE_RANGE
-    """Half sizes in sides of the cube; interpolated on a logarithmic scale."""
+    size_range: tuple[float, float] = (0.04, 1.2)
+    """Half sizes in sides of the cube, interpolated on a logarithmic scale; the thesis' bodies reach 0.8."""
     shape_range: tuple[float, float] = (0.1, 1.0)
     translation_range: tuple[float, float] = (-0.4, 1.4)
     backbone: Backbone = "compact"
-    framing: Framing = "cropped"
-    """What the views show, as :mod:`sq_perception.learning.networks` has it."""
-    marks_hidden: bool = False
-    """Whether views distinguish hidden pixels from background (``CanonicalView.marked``)."""
+    framing: Framing = "cropped"  # what the views show (sq_perception.learning.networks)
+    marks_hidden: bool = False  # whether views distinguish hidden pixels from background (CanonicalView.marked)
 
     def __post_init__(self) -> None:
         for name, value, known in (("backbone", self.backbone, Backbone), ("framing", self.framing, Framing)):
@@ -111,11 +107,9 @@ class ThingConfig:
     pixels: int = 64
     widths: tuple[int, ...] = (32, 64, 128, 256)
     """Channels of the stem and of each stage; every stage halves the resolution."""
-    blocks: int = 2
-    """Residual blocks a stage."""
+    blocks: int = 2  # residual blocks a stage
     hidden: int = 256
-    factors: int = 8
-    """K, the columns of L."""
+    factors: int = 8  # K, the columns of L
     freedom: float = 3.0
     """nu of the t distribution.  Trained with 10, the errors on unseen views were likeliest for 2 to 3,
     sigma a third as large: most hulls are plain to see, some are not."""
@@ -140,8 +134,7 @@ class MaskConfig:
     pixels: int = segment_view.PIXELS
     widths: tuple[int, ...] = (16, 32, 64, 64)
     """Channels of the stem and of each stage; every stage halves the resolution."""
-    blocks: int = 1
-    """Residual blocks a stage on the way down."""
+    blocks: int = 1  # residual blocks a stage on the way down
 
 
 def side_inputs(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:

@@ -1,13 +1,12 @@
 """Train a network on views that a folder holds: that of things, and that of masks.
 
-Making a view takes as long as learning from it, and each is worth being seen several times; so views are written into
-a folder first, shard by shard, or meanwhile by another process, and a training reads what it finds there, again and
-again.  Of more shards than the memory is to hold it reads some, others after each validation.
+Making a view takes as long as learning from it, and each is worth being seen several times: views are written into a
+folder, shard by shard, and a training reads what it finds there.  Of more shards than the memory is to hold it reads
+some, others after each validation.
 
-The learning rate falls as a cosine over the time that the run is given, as on a CPU the time is what is known
-beforehand.  Views of the ``held`` first shards that a run finds are never trained on: the log has the network's figures
-on them, and what is set when a run ends is set by them.  The state of the run names them, so that shards that come
-later change nothing in that.
+The learning rate falls as a cosine over the time that the run is given.  Views of the ``held`` first shards that a run
+finds, which its state names, are never trained on: the log has the network's figures on them, and what is set when a
+run ends is set by them.
 
 The network of things
 ---------------------
@@ -15,9 +14,8 @@ Half of the views are shown as in a mirror, of some the extent is kept back.
 
     loss = mean over views of  -log p(h) / J  +  2 |h_body - h|  +  |mu - h|
 
-The likelihood is of order 1 where the other terms are of order 0.05, and alone makes the first steps wild; the last
-term leads.  The log has the mean error of h by kind of thing,
-and the standard deviation of error / sigma, which an honest network has at 1.
+The likelihood alone makes the first steps wild; the last term leads.  The log has the mean error of h by kind of
+thing, and the standard deviation of error / sigma, which should be 1.
 
 The network of masks
 --------------------
@@ -71,18 +69,13 @@ between two validations."""
 class NetworkKind:
     """What is particular to a network that is trained on shards of views, a dataclass of arrays (n, ...)."""
 
-    name: str
-    """Name of its file of weights and of its command, ``train-NAME``."""
-    none: Any
-    """No views at all, in the form of all."""
-    network: Callable[[str], Any]
-    """A network to begin with, from the weights that :attr:`ShardTraining.start` names."""
+    name: str  # name of its file of weights and of its command, train-NAME
+    none: Any  # no views at all, in the form of all
+    network: Callable[[str], Any]  # a network to begin with, from the weights that ShardTraining.start names
     batch: Callable[[Any, np.ndarray, np.random.Generator], tuple[np.ndarray, ...]]
     """What the network takes of the views of these numbers, varied at random, and last the truth about them."""
-    loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]
-    """As :attr:`Task.loss`."""
-    validate: Callable[[Any, Any], dict[str, Any]]
-    """Figures of the network on views."""
+    loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]  # as Task.loss
+    validate: Callable[[Any, Any], dict[str, Any]]  # figures of the network on views
     finish: Callable[..., None] = lambda network, views: None
     """Changes a network when its training ends, by views that it was not trained on: errors on the others are smaller,
     by a seventh after 8 million views of 700 000."""
@@ -214,11 +207,9 @@ def validate_things(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
 
 
 def calibrate_spread(network: ThingNetwork, views: ThingViews) -> None:
-    """Scale S so that error / sigma deviates by 1 on these views, as the network predicts and does not learn.
+    """Scale S so that error / sigma deviates by 1 on these views; 4000 views settle it to 2 %.
 
-    The likelihood would ask for less: where the tails of the errors are longer than those of the t distribution they
-    are taken for rare, and 1.3 is left.  But sigma is what a fit weighs by and a user is told.  4000 views settle it to
-    2 %.
+    The likelihood leaves 1.3, as it takes errors in longer tails than those of the t distribution for rare.
     """
     spread = network.config.spread * validate_things(network, views)["ratio"] ** 2
     network.config = replace(network.config, spread=float(spread))

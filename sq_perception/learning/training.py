@@ -44,18 +44,14 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
 class Task:
     """What is particular to the training of one network."""
 
-    command: str
-    """The command that runs it."""
-    newest: str
-    """Name of the file of weights that each validation replaces."""
+    command: str  # the command that runs it
+    newest: str  # name of the file of weights that each validation replaces
     batch: Callable[[], tuple[tuple[torch.Tensor, ...], Any]]
     """What the network takes of a batch, and the truth about it, on the run's device."""
     loss: Callable[[Any, tuple[torch.Tensor, ...], Any, float], torch.Tensor]
     """Loss of the network's output for what it took, the truth, and the share of the run that is done."""
-    validate: Callable[[Any], dict[str, Any]]
-    """Figures of a network on views that it is not trained on."""
-    finish: Callable[[Any], None] = lambda network: None
-    """Changes a network when its training ends."""
+    validate: Callable[[Any], dict[str, Any]]  # figures of a network on views that it is not trained on
+    finish: Callable[[Any], None] = lambda network: None  # changes a network when its training ends
     score: Callable[[dict[str, Any]], tuple[float, float]] | None = None
     """What of the figures the best network, kept as model.safetensors, has most of, and the loss of a plateau."""
 
@@ -70,16 +66,12 @@ class TrainingState:
     path: Path
     model: Any
     optimizer: torch.optim.Optimizer
-    settings: str = ""
-    """What the run is made of, JSON."""
+    settings: str = ""  # what the run is made of, JSON
     average: Any = field(init=False)
     plateau: Plateau = field(default_factory=Plateau)
-    step: int = 0
-    """Steps done."""
-    seconds: float = 0.0
-    """Time spent, in all parts of the run."""
-    best: float = -math.inf
-    """Best validation so far."""
+    step: int = 0  # steps done
+    seconds: float = 0.0  # time spent, in all parts of the run
+    best: float = -math.inf  # best validation so far
     held: list[str] = field(default_factory=list)
     """Names of the files of views that are kept for validation, where a run has such."""
 
@@ -266,10 +258,7 @@ def _keep(state: TrainingState, config: Run, task: Task, record: dict[str, Any])
 
 
 def mixed_precision(device: str, wanted: bool) -> torch.autocast:
-    """Within it a network computes in bfloat16, where that is wanted and the device has such products.
-
-    A processor without them takes 16 times as long for a step in it as in float32, one with them half as long.
-    """
+    """Within it a network computes in bfloat16, where that is wanted and the device has such products."""
     has_products = device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     return torch.autocast(device, torch.bfloat16, enabled=wanted and has_products)
 
@@ -278,9 +267,7 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
 def threads(count: int) -> Iterator[None]:
     """So many threads for a network and for the rendering of its views; 0 leaves both their own choice.
 
-    Each has a pool of its own, and OpenMP's threads wait by spinning.  Beside other work on all cores, a renderer's
-    second thread, which got its turn late and held a core while it had nothing to do, made a run of one torch thread
-    more than seven times as slow.
+    Each has a pool of its own, whose threads wait by spinning: beside other work a second one makes both much slower.
     """
     before = torch.get_num_threads(), numba.get_num_threads()
     if count:

@@ -190,15 +190,12 @@ class ShardTraining(Run):
 
     batch: int = 64
     warm_up: int = 100
-    average: float = 0.998
-    """Some 500 steps."""
+    average: float = 0.998  # some 500 steps
     bfloat16: bool = False
     validation: int = 200
     seed: int = 0
-    minutes: float = 60.0
-    """Training time, that of all parts of a stopped run together."""
-    held: int = 2
-    """Shards that are kept for validation."""
+    minutes: float = 60.0  # training time, that of all parts of a stopped run together
+    held: int = 2  # shards that are kept for validation
 
     def progress(self, step: int, seconds: float, plateau: Plateau) -> float:
         return seconds / (60 * self.minutes)

@@ -77,8 +77,7 @@ _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDic
 class _Built:
     recoverer: Recoverer
     parameters: RecoverParameters
-    key: tuple[Hashable, ...]
-    """Equal for recoverers that nodes may share; begins with the weights."""
+    key: tuple[Hashable, ...]  # equal for recoverers that nodes may share; begins with the weights
 
 
 class Engine:
@@ -89,10 +88,8 @@ class Engine:
         self._built: _Built | None = None
         self._last: dict[Hashable, Reference] = {}
         """State that the last frame leaves for the next, by its frame_id and origin."""
-        self._is_due = False
-        """Whether a parameter was set that may need another recoverer."""
-        self.fault = ""
-        """Why the last change failed; empty once one has succeeded."""
+        self._is_due = False  # whether a parameter was set that may need another recoverer
+        self.fault = ""  # why the last change failed; empty once one has succeeded
 
     def build(self, parameters: RecoverParameters) -> None:
         """Make and warm up the recoverer.  Raises ValueError if the model or the device cannot be used."""

@@ -23,6 +23,7 @@ from typing import Any, cast
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -41,7 +42,6 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched_qos, stamp_of
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.managed_node import ManagedNode, optional
-from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import EVERYWHERE, LiveParameters, Parameters, check_box, check_prefix, setting
 from sq_perception.nodes.statistics import OLDEST, THROTTLE, Statistics
 from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
@@ -97,14 +97,12 @@ class GraspNode(ManagedNode):
         self._settings = LiveParameters(self, GraspParameters)
         self._last: PointCloud2 | None = None
         self._heard_at = monotonic()
-        self._arrival = 0.0
-        """Its arrival, seconds of the node's clock."""
+        self._arrival = 0.0  # its arrival, seconds of the node's clock
         self._plane: PoseStamped | None = None
         # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
         self._outputs: list[Publisher] = []
         self._array: Publisher | None = None
-        self._publishing = threading.Lock()
-        """Held while publishing, or while publishing ends."""
+        self._publishing = threading.Lock()  # held while publishing, or while publishing ends
         self._clouds: Listener | None = None
         self._planes: Any = None
         self.create_service(Trigger, "~/plan", self._on_plan)
@@ -139,7 +137,7 @@ class GraspNode(ManagedNode):
             if self._outputs and self._last is not None and self.context.ok():
                 shown = self._outputs[-1]
                 shown.publish(markers([], [], self._last.header, namespace="grasps"))
-                shown.wait_for_all_acked(ARRIVAL)
+                shown.wait_for_all_acked(Duration(seconds=0.5))  # before the publisher is destroyed
             for publisher in (*self._outputs, *([] if self._array is None else [self._array])):
                 self.destroy_publisher(publisher)
             self._outputs, self._array = [], None

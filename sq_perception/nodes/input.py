@@ -2,9 +2,7 @@
 
 Callbacks of the executor store messages; one worker thread takes the newest complete depth image.  An image is complete
 with the camera_info of its stamp, or else the latest of its size, and, if masks are expected, with the mask of its
-stamp.  It waits ``patience`` seconds for them, while newer images arrive: no computation waits for a message, and a
-frame gets its mask even if the network that makes it is slower than the camera.  Once an image is complete, or its
-patience has expired, it replaces every older one.
+stamp, for which it waits ``patience`` seconds while newer images arrive.  Then it replaces every older one.
 """
 
 from __future__ import annotations
@@ -21,15 +19,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.nodes.frame import (
-    DepthMessage,
-    Frame,
-    MaskMessage,
-    decode,
-    image_topic,
-    listen_to_latched_info,
-    stamp_of,
-)
+from sq_perception.nodes import frame as frames
+from sq_perception.nodes.frame import DepthMessage, Frame, MaskMessage, stamp_of
 from sq_perception.nodes.listener import Listener
 from sq_perception.nodes.managed_node import optional
 from sq_perception.nodes.parameters import POINTS, RAW, LiveParameters, RecoverParameters
@@ -79,20 +70,16 @@ class Input:
     ) -> None:
         self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
         transport = settings.current.image_transport
-        self.topic = image_topic(node, transport)
-        """Topic of the depth images."""
+        self.topic = frames.image_topic(node, transport)  # topic of the depth images
         self._note = ""
         self._numbers_note: tuple[str, ...] = ()
         self._last_image = monotonic()
-        self._changed = threading.Condition()
-        """Guards the following attributes."""
+        self._changed = threading.Condition()  # guards the following attributes
         self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=16)
-        self._image_stamp = -1
-        """Stamp of the last image."""
-        self._are_paired = False
-        """Whether an image has had a camera_info of its own stamp."""
+        self._image_stamp = -1  # stamp of the last image
+        self._are_paired = False  # whether an image has had a camera_info of its own stamp
         self._masks: OrderedDict[int, MaskMessage] = OrderedDict()
         self._is_closed = False
         # Subscriptions are served in this order: what an image needs is there before the image.
@@ -117,7 +104,7 @@ class Input:
             text = f"{topic} is not read: yolo_msgs is not installed, or its workspace is not sourced"
             self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE)
         if self._info is not None and self._latched is None and not self._is_closed:
-            self._latched = listen_to_latched_info(self._node, self._info.topic, self._on_info)
+            self._latched = frames.listen_to_latched_info(self._node, self._info.topic, self._on_info)
 
     @property
     def _listeners(self) -> tuple[Listener, ...]:
@@ -176,7 +163,7 @@ class Input:
         Raises ValueError for anything that keeps it from being processed.
         """
         message, use, source = arrival.message, parameters.use_masks, self._info
-        frame = decode(
+        frame = frames.decode(
             message, None if source is None else lambda: self._calibration_of(message, source),
             parameters.depth_scale or None, parameters.depth_kind, view,
         )

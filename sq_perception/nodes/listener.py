@@ -43,8 +43,7 @@ class Listener:
     ) -> None:
         self._node, self._kind, self._callback, self._statistics = node, kind, callback, statistics
         # Kept: of a subscription that another thread destroys meanwhile not even the name can be asked.
-        self.topic = str(node.resolve_topic_name(topic))
-        """The resolved name."""
+        self.topic = str(node.resolve_topic_name(topic))  # the resolved name
         self._asked = _reliability_override(node, self.topic)
         self._lock = threading.Lock()
         """Guards the subscription: it is replaced in the executor's thread and closed in another one."""

@@ -82,10 +82,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         # seconds that a model takes to load, and raises RCLError for one that the state does not allow, which ends it.
         (service,) = (each for each in self.services if each.srv_type is ChangeState)
         service.callback = self._on_change_state  # type: ignore[assignment]  # executors await it
-        self.fault = ""
-        """Why the last transition failed; empty once one has succeeded."""
-        self.start_failure = ""
-        """Why the node could not start itself; its process then ends."""
+        self.fault = ""  # why the last transition failed; empty once one has succeeded
+        self.start_failure = ""  # why the node could not start itself; its process then ends
         self._starts_itself = False
         self._closing = threading.Event()
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -178,7 +176,17 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     def _fail(self, reason: str) -> None:
         """Leave the active state because of a fault that further frames would repeat; from any thread."""
-        self._tasks.put(lambda: self._leave_by_fault(reason))
+
+        def leave() -> None:
+            if not self.is_active or self._closing.is_set():
+                return
+            self.get_logger().error(f"{reason}: trying again in {_PAUSE:g} s" if self._starts_itself else reason)
+            self.fault = reason
+            self._change("deactivate")
+            if self._starts_itself and not self._closing.wait(_PAUSE):
+                self._bring_up()
+
+        self._tasks.put(leave)
 
     # Transitions, all in one thread
 
@@ -234,15 +242,6 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def _bring_up(self) -> None:
         if not (self._change("configure") and self._change("activate")) and not self._closing.is_set():
             self.start_failure = self.fault or f"the node is {self.state}"
-
-    def _leave_by_fault(self, reason: str) -> None:
-        if not self.is_active or self._closing.is_set():
-            return
-        self.get_logger().error(f"{reason}: trying again in {_PAUSE:g} s" if self._starts_itself else reason)
-        self.fault = reason
-        self._change("deactivate")
-        if self._starts_itself and not self._closing.wait(_PAUSE):
-            self._bring_up()
 
     def _end(self) -> None:
         if self.is_configured or self.state == "unconfigured":

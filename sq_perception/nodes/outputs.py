@@ -46,8 +46,6 @@ from sq_perception.recovery.recoverer import render_recovery
 from sq_perception.recovery.recovery import timed
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
-ARRIVAL = Duration(seconds=0.5)
-"""Seconds that the last markers may take to arrive before their publisher is destroyed."""
 
 
 class Outputs:
@@ -57,8 +55,7 @@ class Outputs:
         self._node = node
         self.optional = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
-        self._header: Any = None
-        """Header of the markers that are shown, if there are any."""
+        self._header: Any = None  # header of the markers that are shown, if there are any
 
     def open(self, parameters: RecoverParameters) -> None:
         """Create the publishers."""
@@ -78,7 +75,7 @@ class Outputs:
         """Destroy the publishers and delete the markers; planners keep their objects."""
         if self._publishers:
             self.hide()
-            self.markers.wait_for_all_acked(ARRIVAL)
+            self.markers.wait_for_all_acked(Duration(seconds=0.5))  # before the publisher is destroyed
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
         self._publishers = ()
@@ -157,8 +154,7 @@ class OptionalOutputs:
     def __init__(self, node: Node) -> None:
         self._node = node
         self._publishers: dict[str, Publisher] = {}
-        self.absent: dict[str, str] = {}
-        """Missing packages by output; replaced as a whole, for other threads."""
+        self.absent: dict[str, str] = {}  # missing packages by output; replaced as a whole, for other threads
         self._scene = collision_objects.Scene()
         self._planner_came = threading.Event()
         self._all_due = 0.0

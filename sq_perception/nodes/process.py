@@ -7,9 +7,8 @@ The shipped Fast DDS profile, which prevents the loss of large images, is used u
 of Jazzy reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so the variable must
 be set before rclpy.init; it ignores its successor's variable, FASTDDS_DEFAULT_PROFILES_FILE.
 
-Garbage collection: numba and SciPy make 100 000 objects that live as long as the process.  During their import 260
-collections would free almost nothing and take 0.13 of 1.1 seconds; later each full collection would take 60 ms, in the
-middle of a frame.  So collection is off while a node starts, and later excludes the objects of the start.
+Garbage collection: numba and SciPy make 100 000 objects that live as long as the process; with them a full collection
+takes 60 ms, in the middle of a frame.  So it is off while a node starts, and later excludes the objects of the start.
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ if TYPE_CHECKING:
 PROFILE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
-"""Spinning threads take cores from other nodes: on two busy cores a frame took 30 ms with these settings and 50 to 150
-ms without. Small solves and images gain nothing from a second thread: OpenCV's took a tenth of the processor time of a
-VGA frame of one body, and saved 2 % on an idle core."""
-
+"""Spinning threads take cores from other nodes, and small solves and images gain nothing from a second thread."""
 
 _Node = TypeVar("_Node", bound="Stoppable")
 REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
@@ -47,8 +43,7 @@ REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation
 class Stoppable(Protocol):
     """An rclpy node that may fail to start, and must be stopped before it is destroyed."""
 
-    start_failure: str
-    """Why the node cannot start, once known; its process then ends."""
+    start_failure: str  # why the node cannot start, once known; its process then ends
 
     def close(self) -> bool:
         """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""

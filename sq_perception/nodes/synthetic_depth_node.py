@@ -124,8 +124,7 @@ class FrameSource:
         self._make, self._count, self._hold, self._loop = make, count, hold, loop
         self._noise = np.random.default_rng([seed, 2])
         self._position, self._left = 0, hold
-        self.clean = make(0)
-        """The current image without noise."""
+        self.clean = make(0)  # the current image without noise
 
     def next(self, noise: float, sensor: str = IDEAL) -> SourceFrame | None:
         """Return the next image as the sensor measures it; None after the last one.

@@ -2,10 +2,9 @@
 
 A folder gives its frames and bags in natural order (frame_2 before frame_10), by their times where all names are times,
 NPYs only where it has nothing else, as matrices of calibrations are such files too; one without any gives those of its
-subfolders, down to four levels, or of the one called depth.  The camera of its images, and of an image that is named
-by itself, is one of ``camera_file.CAMERA_FILES`` beside it or in the folder that was named, else the YAML of its own
-name.
-What cannot be read comes as an error with the reason, in its place, and the rest follows.
+subfolders, down to four levels, or of the one called depth.  The camera of an image is one of
+``camera_file.CAMERA_FILES`` beside it or in the folder that was named, else the YAML of its own name.  What cannot be
+read comes as an error with the reason, in its place.
 
 Bodies get ids by a tracking session over each sequence, a topic of a bag or the frames of one folder, of a camera that
 stands still.  Frames without a stamp are taken to be INTERVAL apart.  With camera poses all frames show one scene that
@@ -65,8 +64,7 @@ class RecordedInput:
             treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
             camera_file.read_calibration(self._options.camera_info, treatment, size=ANY_SIZE)
         self._sources = [source for name in names for source in self._name(name)]
-        self.total = len(self._sources)
-        """Frames to expect; a bag counts as one until it is opened."""
+        self.total = len(self._sources)  # frames to expect; a bag counts as one until it is opened
 
     @property
     def files(self) -> list[Path]:
@@ -142,11 +140,9 @@ class RecordedInput:
 
 def in_folder(folder: Path) -> list[Path]:
     """Return the frames and bags in a folder: by their times where all names are times, else in natural order."""
-
-    def is_frame(path: Path) -> bool:
-        return path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir()  # a broken link is reported
-
-    found = sorted((path for path in folder.iterdir() if is_frame(path) or bag_file.is_bag(path)), key=_natural)
+    within = sorted(folder.iterdir(), key=_natural)
+    is_frame = [path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir() for path in within]  # or a broken link
+    found = [path for path, wanted in zip(within, is_frame, strict=True) if wanted or bag_file.is_bag(path)]
     found = [path for path in found if path.suffix.lower() != ".npy"] or found
     times = {path: stamp for path in found if (stamp := frame_file.stamp_of(path))}
     return found if len(times) < len(found) else sorted(found, key=times.__getitem__)

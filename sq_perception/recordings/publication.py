@@ -16,14 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sq_msgs_py import poses
-from sq_msgs_py.depth_image import (
-    DEPTH_ENCODINGS,
-    depth_to_message,
-    grey_from_message,
-    grey_to_message,
-    pixels_from_message,
-)
+from sq_msgs_py import depth_image, poses
 from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.markers import Mesh as MarkerMesh
 from sq_msgs_py.message_types import MessageTypes, find_type
@@ -276,8 +269,8 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
 def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = find_type) -> Any:
     """Return an Image of depth (height, width) in metres, NaN or inf for nothing; mono8 and mono16: of the cube."""
     if encoding in _GREY_TYPES:
-        return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
-    return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), header, encoding, types)
+        return depth_image.grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
+    return depth_image.depth_to_message(np.where(np.isfinite(depth), depth, np.nan), header, encoding, types)
 
 
 def depth_of(
@@ -290,12 +283,13 @@ def depth_of(
     :func:`depth_units.metres` takes them.  Raises ValueError for anything else.
     """
     if is_cube:
-        return Metres(unit_cube.depth_from_grey(grey_from_message(message))), str(message.encoding)
+        return Metres(unit_cube.depth_from_grey(depth_image.grey_from_message(message))), str(message.encoding)
     if hasattr(message, "format"):
         numbers = compressed_depth.decode(message.format, message.data)
         encoding = compressed_depth.encoding(message.format) or ""
     else:
-        numbers, encoding = pixels_from_message(message, DEPTH_ENCODINGS), str(message.encoding)
+        numbers = depth_image.pixels_from_message(message, depth_image.DEPTH_ENCODINGS)
+        encoding = str(message.encoding)
     found = depth_units.metres(numbers, scale, known)
     return found, encoding if found.scale == depth_units.MILLIMETRES else "32FC1"  # millimetres hold no other units
 

@@ -17,8 +17,7 @@ was no message has the frame id of the synthetic camera.  Messages are logged wh
 that, at the stamp.
 
 An interrupted run leaves a whole file of fewer frames; a full disk leaves one without an index, from which
-``mcap recover`` makes a file.  Messages are rosbags' classes, which want every field and arrays of numbers as NumPy has
-them; ROS has defaults and takes lists.
+``mcap recover`` makes a file.  rosbags' classes of messages want every field, and arrays of NumPy.
 """
 
 from __future__ import annotations

@@ -93,7 +93,11 @@ def frame_entry(
         "topic": frame.topic or None,
         "frame_id": frame.frame_id or None,
     }
-    # Plain numbers and lists for those of NumPy, and null for NaN and infinity, which JSON does not know.
+    return plain_values(entry)
+
+
+def plain_values(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return plain numbers and lists for those of NumPy, and None for NaN and infinity, which JSON does not know."""
     text = json.dumps(entry, default=lambda value: value.tolist())
     plain: dict[str, Any] = json.loads(text, parse_constant=lambda _: None)
     return plain
@@ -146,9 +150,8 @@ def _parameters(body: Superquadric) -> dict[str, Any]:
 def scene_entry(track: Track) -> dict[str, Any]:
     """Return the element of ``scene``: a body of the world of the camera poses."""
     weak = undetermined(track.covariance, track.superquadric.size).any()
-    numbers = {**_parameters(track.superquadric), "sigma_size": track.sigma_size}
-    values = {name: value.tolist() for name, value in numbers.items()}
-    return {"id": track.id, "seen": track.seen, "status": "weak" if weak else "converged", **values}
+    about = {"id": track.id, "seen": track.seen, "status": "weak" if weak else "converged"}
+    return plain_values({**about, **_parameters(track.superquadric), "sigma_size": track.sigma_size})
 
 
 def document(

@@ -20,27 +20,16 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.seen_object import SeenObject, surroundings
 
-_SCORE_STRIDE = 3
-"""22 x 22 lines of sight of 64 voxels settle a score to a hundredth."""
-_LEAST_MEASURED = 0.02
-"""Share of a mask: a sensor that sees nothing of a thing smears its outline; bodies of masks that showed
-less were of 20 % IoU at most."""
-_PLANE_ABOVE = "the plane found lies above it and was left aside"
-_MAY_GO_ON = "it may go on in what is next to it"
-_LEAST_BUDGET = 1e-6
-"""Seconds; an object whose turn comes too late is still fitted, from one start."""
-_HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""What numerical code may raise on degenerate data: reported with the object, never raised."""
-
 
 def fit_view(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     """The body of an object by the chosen method; FAILED with a reason instead of any exception on hard data."""
-    if obj.pixels < max(MIN_PIXELS, _LEAST_MEASURED * obj.masked):
+    # A sensor that sees nothing of a thing smears its outline: bodies of masks that showed less had 20 % IoU at most.
+    if obj.pixels < max(MIN_PIXELS, 0.02 * obj.masked):
         of_all = f" of {obj.masked}" if obj.pixels >= MIN_PIXELS else ""
         return _failure(obj, f"{obj.pixels}{of_all} pixels with a depth are too few for a body")
     try:
         return _body(obj, depth, camera, options, deadline)
-    except _HARD_IMAGE as error:  # a body that is not finite too
+    except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:  # of degenerate data, or an infinite body
         return _failure(obj, f"{options.method}: {error}")
 
 
@@ -49,7 +38,8 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
         return solina_bajcsy.fit(obj.points)
     if options.method == "network":
         return _predict(obj)
-    known = FitOptions(plane=obj.plane, time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET))
+    left = max(deadline - time.perf_counter(), 1e-6)  # an object whose turn comes too late is fitted from one start
+    known = FitOptions(plane=obj.plane, time_budget=left)
     if not options.free_space:
         depth = np.where(obj.mask, depth, np.float32(np.nan))
         known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR)
@@ -57,15 +47,11 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
         return _surface_fit(obj, depth, camera, known)
     except PlaneError:  # it is what the object hangs below, or no support at all
         found = _surface_fit(obj, depth, camera, replace(known, plane=None))
-        return replace(found, message=f"{found.message}; {_PLANE_ABOVE}")
+        return replace(found, message=f"{found.message}; the plane found lies above it and was left aside")
 
 
 def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
-    """The surface fit, with the prediction if there is one: as a start, and as what is expected of the body where the
-    image leaves it open, such as the depth of a box seen face-on.
-
-    A prediction may be computed only when the fit asks for it, which it need not do for images without noise.
-    """
+    """The surface fit, with the prediction, if there is one, as a start and where the image leaves the body open."""
     # As much of the image as the fit looks at, and more.
     _, near, mask, view = surroundings(obj, depth, obj.mask, camera, max(obj.mask_crop.shape) + BAND_PIXELS)
     if obj.prediction is None:
@@ -95,7 +81,7 @@ def widen(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
     is_open = fit.status == Status.CONVERGED and undetermined(covariance, body.size).any()
     if not is_open:
         return replace(fit, covariance=covariance)
-    return replace(fit, covariance=covariance, status=Status.WEAK, message=_MAY_GO_ON)
+    return replace(fit, covariance=covariance, status=Status.WEAK, message="it may go on in what is next to it")
 
 
 def _predict(obj: SeenObject) -> Fit:
@@ -125,8 +111,9 @@ def score(obj: SeenObject, fit: Fit, options: RecoveryOptions) -> float:
         return 0.0
     body = view.to_canonical(fit.superquadric)
     parameters = np.concatenate([body.size, body.shape, body.translation, body.taper])
+    # With a stride of 3, 22 x 22 lines of sight of 64 voxels settle a score to a hundredth.
     agreement = soft_agreement.agreement(
-        view.image, _SCORE_STRIDE, parameters, body.rotation_matrix, options.sharpness, options.tau
+        view.image, 3, parameters, body.rotation_matrix, options.sharpness, options.tau
     )
     if not np.isfinite(agreement):
         return 0.0

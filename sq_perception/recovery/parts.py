@@ -42,32 +42,17 @@ from sq_perception.segmentation.line_of_sight import SampledImage
 MOST_PARTS = 4
 _SAMPLES = 120
 """Samples of an object between which lines are drawn."""
-_LIMITS = (0.55, 0.35, 0.2)
-"""Distances between clusters up to which they are one piece."""
-_WIDE = 0.7
-"""Radius of wide discs, as a share of that of the widest one in an object."""
 _LEAST_SHARE = 0.03
 """Share of the object's samples that a piece has at least."""
-_THROUGH = 2.0
-"""Deviations of the noise behind a line from which on it is crossed."""
 _WITNESSES = 120.0
 """N above."""
 _FARTHEST = 3.0
 """Deviations of the noise beyond which a pixel is not explained."""
-_RAYS = 500
-"""Pixels of an object whose depth is compared, about."""
 _PRICE = 11 / 2 * math.log(_WITNESSES) * 2 / _WITNESSES
 """What a further body must lessen L by."""
-_OPEN = 0.012
-"""Free pixels that a body covers, as a share of the object's pixels, from which on it is more than one: a body through
-which nothing was seen leaves no room between parts."""
-_JOINT_SPREAD = 4.0
-"""Factor of the covariance of a part: where one ends and the next one begins is not seen."""
 _FINE = 1.3
 """L of good bodies, mostly: where one leaves no more than the price above it, two are not sought, nor handles where
 parts do."""
-_SAME = 0.9
-"""IoU of the pixels of two pieces from which on they have one body."""
 
 
 class Weight(NamedTuple):
@@ -93,7 +78,7 @@ class Evidence:
     @classmethod
     def of(cls, obj: SeenObject, depth: np.ndarray, camera: Camera, sigma: float) -> Evidence:
         rows, columns = obj.mask_crop.shape
-        step = max(1, math.isqrt(int(np.count_nonzero(obj.mask_crop)) // _RAYS))
+        step = max(1, math.isqrt(int(np.count_nonzero(obj.mask_crop)) // 500))  # pixels that are compared, about
         _, near, mask, view = surroundings(obj, depth, obj.mask, camera, max(rows, columns) // 4)
         near, mask = near[::step, ::step], mask[::step, ::step]
         fx, fy, cx, cy = (number / step for number in (view.fx, view.fy, view.cx, view.cy))
@@ -118,8 +103,7 @@ class Search:
 
     def __init__(self, obj: SeenObject, alone: Fit, depth: np.ndarray, camera: Camera) -> None:
         self._noise = alone.noise
-        self.parts: Parts | None = None
-        """The best ones so far; None where one body is the shorter description."""
+        self.parts: Parts | None = None  # the best ones so far; None where one body is the shorter description
         self._divisions: list[Iterator[list[SeenObject]]] = []
         self._fitted: list[tuple[SeenObject, Fit]] = []
         self._fresh: list[SeenObject] = []
@@ -130,15 +114,20 @@ class Search:
         self._evidence = Evidence.of(obj, depth, camera, alone.noise)
         weight = self._evidence.weigh([alone])
         self._least = weight.misfit
-        if weight.misfit > _FINE + _PRICE and weight.through > _OPEN:
-            kinds = _divide(obj, _THROUGH * alone.noise), _divide_thin(obj)
+        # A body through which nothing was seen leaves no room between parts.
+        if weight.misfit > _FINE + _PRICE and weight.through > 0.012:
+            kinds = _divide(obj, 2 * alone.noise), _divide_thin(obj)
             self._divisions = [(list(_make_objects(obj, depth, camera, each)) for each in kind) for kind in kinds]
 
     def next_pieces(self) -> list[SeenObject]:
         """Return the pieces of the next division that have no body yet; none where the search has ended."""
+
+        def alike(one: SeenObject, other: SeenObject) -> bool:
+            return bool(np.sum(one.mask & other.mask) > 0.9 * np.sum(one.mask | other.mask))
+
         while self._divisions:
             for pieces in self._divisions[0]:
-                known = [(piece, [fit for other, fit in self._fitted if _is_same(piece, other)]) for piece in pieces]
+                known = [(piece, [fit for other, fit in self._fitted if alike(piece, other)]) for piece in pieces]
                 self._fresh = [piece for piece, fits in known if not fits]
                 self._again = [fits[0] for _, fits in known if fits]
                 if self._fresh:
@@ -156,16 +145,13 @@ class Search:
             if left < self._least:
                 self._least = left
                 milliseconds = sum(fit.milliseconds for fit in fits)
-                wide = [replace(fit, covariance=_JOINT_SPREAD * fit.covariance) for fit in fits]
+                # Wider, as where a part ends and the next one begins is not seen.
+                wide = [replace(fit, covariance=4 * fit.covariance) for fit in fits]
                 self.parts = Parts.of(wide, weight.shares, self._noise, milliseconds)
                 if weight.misfit <= _FINE + _PRICE:
                     del self._divisions[1:]
                 return
         self._divisions.pop(0)
-
-
-def _is_same(one: SeenObject, other: SeenObject) -> bool:
-    return bool(np.sum(one.mask & other.mask) > _SAME * np.sum(one.mask | other.mask))
 
 
 def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
@@ -179,7 +165,7 @@ def _divide(obj: SeenObject, through: float) -> Iterator[np.ndarray]:
         return
     crossed, far = image.within(some)
     seen = set()
-    for limit in _LIMITS:
+    for limit in (0.55, 0.35, 0.2):  # distances between clusters up to which they are one piece
         group = cluster(crossed, far, limit, max(4, _LEAST_SHARE * len(far)))
         if 0 < group.max() < MOST_PARTS and group.tobytes() not in seen:
             seen.add(group.tobytes())
@@ -193,7 +179,7 @@ def _divide_thin(obj: SeenObject) -> Iterator[np.ndarray]:
     """Yield a label image as :func:`_divide`: 1 where wide discs lie within the object's pixels, then what is thin."""
     mask = obj.mask_crop & np.isfinite(obj.depth_crop)
     inside = cv2.distanceTransform(np.pad(mask, 1).view(np.uint8), cv2.DIST_L2, 5)
-    radius = _WIDE * float(inside.max())
+    radius = 0.7 * float(inside.max())  # of wide discs, less than the widest one's
     beside = cv2.distanceTransform((inside <= radius).view(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     thin = mask & (beside > radius)
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(thin.view(np.uint8))

@@ -16,16 +16,9 @@ from sq_perception.recovery.options import RecoveryOptions
 class Readings:
     """One image to recover from.
 
-    Attributes
-    ----------
-    depth : float32 (height, width)
-        Metres, NaN where nothing was measured; small holes of it are filled.
-    filled : bool (height, width) or None
-        The filled pixels: segments and views take them, fits do not.
-    labels : integer (height, width) or None
-        Masks from outside.
-    began
-        When work on it began, by :func:`time.perf_counter`.
+    ``depth``: float32 (height, width), metres, NaN where nothing was measured; small holes are filled.  ``filled``:
+    bool (height, width) or None, the filled pixels: segments and views take them, fits do not.  ``labels``: integer
+    (height, width) or None, masks from outside.  ``began``: when work on it began, by :func:`time.perf_counter`.
     """
 
     depth: np.ndarray

@@ -61,8 +61,6 @@ __all__ = [
     "render_recovery",
 ]
 
-_DOUBT = 0.1
-"""Probability that two objects are one, from which on it counts."""
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
@@ -70,17 +68,7 @@ Network: TypeAlias = inference.Predictor | inference.ThingPredictor
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The objects of one image.
-
-    Attributes
-    ----------
-    segmentation
-        What they were found by.
-    depth : float32 (height, width)
-        The image without readings of objects that are out of range.
-    objects
-        The one with most pixels first.
-    """
+    """The objects of one image, the one with most pixels first; ``depth`` lacks readings of those out of range."""
 
     segmentation: FrameEvidence
     depth: np.ndarray
@@ -260,7 +248,7 @@ class Recoverer:
         fits = self._mapped(lambda obj: methods.fit_view(obj, depth, camera, options, deadline), objects)
         for k, obj in enumerate(objects):
             same = found.segmentation.affinities(obj.label)
-            others = [(q, other) for other in found.objects if (q := same.get(other.label, 0.0)) > _DOUBT]
+            others = [(q, other) for other in found.objects if (q := same.get(other.label, 0.0)) > 0.1]
             fits[k] = methods.widen(fits[k], others)
         return objects, fits, self._find_parts(objects, fits, depth, readings, deadline)
 
@@ -273,8 +261,7 @@ class Recoverer:
             yield
 
     def _segment(self, readings: Readings) -> FrameEvidence:
-        """The objects of an image: the given masks, or its own segments, which the network of masks improves where
-        the network predicts hulls."""
+        """The given masks, or own segments, which the network of masks improves where the other one predicts hulls."""
         depth, camera, options = readings.depth, readings.camera, readings.options
         if readings.labels is not None:
             return segments.from_labels(readings.labels, depth, camera, options)
@@ -339,8 +326,7 @@ class Recoverer:
             return list(self._pool.map(function, items))
 
     def _shared(self, function: Callable[[Sequence[int]], list[_Answer]], items: Sequence[int]) -> list[_Answer]:
-        """The function's answers to all items; each thread calls it once, with a share of them, as a network computes
-        on one thread."""
+        """The function's answers to all items; each thread calls it once, with a share of them."""
         share = -(-len(items) // self._threads)
         parts = [items[first : first + share] for first in range(0, len(items), share)] if items else []
         return [answer for part in self._mapped(function, parts) for answer in part]
@@ -350,7 +336,9 @@ class Recoverer:
         with self._lock:
             if of_things not in self._loaded:
                 kinds = (of_things,) if self._path is None else (True, False)
-                self._loaded.update(dict.fromkeys(kinds, self._read_network(of_things)))
+                is_hull = (self._path is None and of_things) or checkpoint.predicts_hulls(self._path)
+                network = (inference.load_things if is_hull else inference.load)(self._path, self._device)
+                self._loaded.update(dict.fromkeys(kinds, network))
             return self._loaded[of_things]
 
     def _load_masks(self) -> CompactMasks:
@@ -358,8 +346,3 @@ class Recoverer:
             if self._masks is None:
                 self._masks = inference.load_masks()
             return self._masks
-
-    def _read_network(self, of_things: bool) -> Network:
-        if (self._path is None and of_things) or checkpoint.predicts_hulls(self._path):
-            return inference.load_things(self._path, self._device)
-        return inference.load(self._path, self._device)

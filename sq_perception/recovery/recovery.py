@@ -142,15 +142,8 @@ class FrameRecovery:
 
 
 def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """What the recovered bodies, or their parts, would look like to the camera.
-
-    Returns
-    -------
-    depth : float64 (height, width)
-        +inf where there is no body.
-    index : int32 (height, width)
-        Position in ``frame.bodies``, -1 where there is none; failed bodies are not drawn.
-    """
+    """Depth, float64 (height, width), of the recovered bodies or their parts, +inf where there is none, and their index
+    in ``frame.bodies``, int32, -1 where there is none; failed bodies are not drawn."""
     shown = [(k, solid) for k, body in enumerate(frame.bodies) if body.status != Status.FAILED for solid in body.solids]
     depth, index = raycast.render(Superquadric.stack([solid for _, solid in shown]), camera)
     return depth, np.append(np.array([k for k, _ in shown], dtype=np.int32), np.int32(-1))[index]
@@ -212,7 +205,6 @@ def place_as_text(translation: Iterable[float], is_cube: bool) -> str:
 
 
 def _length(metres: float, is_cube: bool, whole: int) -> str:
-    """A length in millimetres, or as a share of the cube, to a millimetre or a thousandth; to a tenth of that below
-    ``whole`` of them."""
+    """A length in whole millimetres, or thousandths of the cube; in tenths of them below ``whole``."""
     digits = 0 if 1e3 * metres >= whole else 1
     return f"{metres:.{3 + digits}f}" if is_cube else f"{1e3 * metres:.{digits}f}"

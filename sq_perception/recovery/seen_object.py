@@ -30,30 +30,18 @@ from sq_perception.segmentation.evidence import FrameEvidence
 
 _POINTS = 2000
 """Enough for quantiles of heights to settle."""
-_VIEW_PIXELS = 64
-"""Pixels a side of the view of a score; those of a network are its own."""
-_LOWEST = 0.02
-"""Share of its pixels that are an object's lowest."""
-_SURROUNDED, _RIM_HEIGHT = 0.6, 0.01
-"""Share of the pixels next to a given mask that go on with it, this many metres above its support, if it is too small.
-Of the second row of pixels around household things 4 % do typically, 70 % where masks are two pixels too small."""
-_LEAST_ROWS, _MOST_ROWS = 2, 4
-"""By how many pixels a given mask is too small, if it is: a sensor widens an edge by one."""
-
+_MOST_ROWS = 4
+"""Pixels by which a given mask is completed at most."""
 
 Answers: TypeAlias = Superquadric | HullPredictions
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a network predicts of one object; perhaps it is computed when it is asked for.
+    """What a network predicts of one object, from ``view``; perhaps it is computed when it is asked for.
 
-    Attributes
-    ----------
-    view
-        What the network was shown.
-    answers, number
-        What gives its answers for several objects, each in the frame of its view, and which of them is this one's.
+    ``answers`` gives the network's answers for several objects, each in the frame of its view, the one at ``number``
+    for this one.
     """
 
     view: CanonicalView
@@ -76,27 +64,13 @@ class Prediction:
 class SeenObject:
     """One object, and what is known of it before its body is sought.
 
-    Attributes
-    ----------
-    label
-        Its value in the label image.
-    pixels, masked
-        Number of the measured pixels of its label, and of all of its label.
-    unread : (n,)
-        Those that were not measured, as indices into the image: a mask from colour tells that the object is there.
-    mask : bool (height, width)
-        What measured it: those pixels without outliers, or with what goes on from them (:func:`complete`);
-        ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask, depth and camera.
-    plane : (4,) or None
-        What it stands on.
-    shown
-        What a network is shown of it, where there is one.
-    view
-        What its score is measured on.
-    prediction
-        What the network says, where there is one.
-    fills
-        Whether it runs out of the image on opposite sides: a surface, and no thing.
+    ``label``: its value in the label image.  ``pixels``, ``masked``: number of measured pixels of its label, and of all
+    of them.  ``unread`` (n,): those that were not measured, as indices into the image: a mask from colour tells that
+    the object is there.  ``mask``: bool (height, width), what measured it: those pixels without outliers, or with what
+    goes on from them (:func:`complete`); ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask,
+    depth and camera.  ``plane`` (4,): what it stands on.  ``shown``: what a network is shown of it.  ``view``: what its
+    score is measured on.  ``prediction``: what the network says.  ``fills``: whether it runs out of the image on
+    opposite sides: a surface, and no thing.
     """
 
     label: int
@@ -142,10 +116,10 @@ class SeenObject:
         return coherent(depth, mask, self.step)
 
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
-        """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
+        """Heights above a plane that a fiftieth and half of its pixels stay below, metres; of some thousand pixels."""
         heights = self.heights(plane)[self.connected]
         heights = heights[:: max(1, heights.size // _POINTS)]
-        return quantile(heights, _LOWEST), quantile(heights, 0.5)
+        return quantile(heights, 0.02), quantile(heights, 0.5)
 
     def of_readings(self, depth: np.ndarray, gaps: np.ndarray, labels: np.ndarray) -> SeenObject:
         """The object in an image (height, width) that has no readings in its ``gaps``, bool (height, width)."""
@@ -184,15 +158,16 @@ def complete(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.ndar
         return obj
     around, near, names, view = surroundings(obj, depth, labels, camera, _MOST_ROWS)
     unnamed = np.isfinite(near) & (names == 0)
-    free = unnamed & (raycast.heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
+    free = unnamed & (raycast.heights(near, unnamed, view.lens, obj.plane) > 0.01)  # metres
     mask, rows = names == obj.label, 0
     while rows < _MOST_ROWS:
         rim = (cv2.dilate(mask.view(np.uint8), depth_steps.CROSS) > 0) & ~mask
         grown = depth_steps.grow(mask.astype(np.int32), free & rim, near, 1, depth_steps.STEP) > 0
-        if np.count_nonzero(grown & rim) <= _SURROUNDED * np.count_nonzero(rim):
+        # Of the second row around household things 4 % go on typically, 70 % where masks are two pixels too small.
+        if np.count_nonzero(grown & rim) <= 0.6 * np.count_nonzero(rim):
             break
         mask, rows = grown, rows + 1
-    if rows < _LEAST_ROWS:
+    if rows < 2:  # a sensor widens an edge by one
         return obj
     whole = np.zeros_like(obj.mask)
     whole[around] = mask & np.isfinite(near)
@@ -225,7 +200,7 @@ def add_views(
         shown = config.view_of(depth, whole, camera, obj.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):
         return replace(obj, shown=shown, view=shown)
-    view = canonical_view.from_mask(obj.depth_crop, inner[obj.window], obj.camera_crop, _VIEW_PIXELS)
+    view = canonical_view.from_mask(obj.depth_crop, inner[obj.window], obj.camera_crop, pixels=64)
     return replace(obj, shown=shown, view=view)
 
 
@@ -261,30 +236,20 @@ def predict_hulls(
     below = np.stack([np.zeros(4) if plane is None else view.plane_to_canonical(plane) for view, plane in known])
     extents = np.array([view.extent for view in views])
     found = network.predict(shown, below, extents, mirror)
-    return _answered(views, lambda: found)
+    return [Prediction(view, lambda: found, k) for k, view in enumerate(views)]
 
 
 def predict_bodies(views: Sequence[CanonicalView], network: Predictor, when_asked: bool) -> list[Prediction]:
     """Predictions of bodies from views: computed now, or all of them when the first one is asked for."""
     shown = np.stack([view.marked for view in views])
-    if when_asked:
-        return _answered(views, _once(lambda: network.predict(shown)))
-    found = network.predict(shown)
-    return _answered(views, lambda: found)
+    lock, found = threading.Lock(), list[Superquadric]()
 
-
-def _once(compute: Callable[[], Answers]) -> Callable[[], Answers]:
-    """A function that computes its answer in the first thread that asks; others wait for it."""
-    lock, found = threading.Lock(), list[Answers]()
-
-    def answers() -> Answers:
-        with lock:
+    def answers() -> Superquadric:
+        with lock:  # of several threads that ask, one computes
             if not found:
-                found.append(compute())
+                found.append(network.predict(shown))
             return found[0]
 
-    return answers
-
-
-def _answered(views: Sequence[CanonicalView], answers: Callable[[], Answers]) -> list[Prediction]:
+    if not when_asked:
+        answers()
     return [Prediction(view, answers, k) for k, view in enumerate(views)]

@@ -1,9 +1,8 @@
 """Objects that did not change since the frame before: readings in them and around them differ by no more than noise.
 
-A body is what a fit makes of readings.  Where these differ by noise alone, another fit would differ by what that noise
-makes of it, which is its covariance.  So the body of the frame before stands, without another segmentation, prediction
-or fit.  It is not refined either: its error is that of the frame it was recovered from, and counts once
-(:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
+Where readings differ by noise alone, another fit would differ by its covariance.  So the body of the frame before
+stands, without another segmentation, prediction or fit; its error is that of the frame it was recovered from, and
+counts once (:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
 
     scene = StillScene(recoverer)
     for depth in video:
@@ -22,10 +21,9 @@ noise that neighbouring pixels share.  What turned, slid, or has another shape m
 frame repeat if its objects do and nowhere, over a patch as small as an object, does q change, or reading appear that
 does not go on with one beside it.
 
-Because readings are compared with those at the recovery, slow motion adds up until it is noticed.  And because the test
-may miss what lies below the noise, and a valley of the fit's cost may have been a wrong one, one body at a time is
-recovered anew when its turn comes, sooner where the view does not determine all of it: in the segment that it had, or,
-as that may have been wrong as well, in segments that are found anew where the old ones are old.
+Because readings are compared with those at the recovery, slow motion adds up until it is noticed.  Because the test may
+miss what lies below the noise, and a fit may have been wrong, one body at a time is recovered anew when its turn comes,
+sooner where the view does not determine all of it; old segments are then found anew, too.
 
 The camera has not moved: where it has, nothing repeats.  Optical frame, metres; pinhole cameras.
 
@@ -54,20 +52,10 @@ from sq_perception.recovery.recoverer import Found, Recoverer
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.segmentation.evidence import FrameEvidence
 
-_WIDTH = 320
-"""Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
 _BAND = 2
 """Compared pixels around an object that belong to it: free space and outline."""
 _CLIP, _FAR = 3.0, 6.0
 """Noise levels: more is an edge that wandered, in an object's sums and in a patch."""
-_CHANGED = 30.0
-"""T of an object that does not repeat: 1 in 5000 by chance; 1 in 50 at the edges of simulated sensors."""
-_MOST = 0.5
-"""Share of an object's pixels that are measured in both frames.  What is taken away where nothing is behind it, or
-comes too near, has none."""
-_PATCH, _NEW = 7, 3.5
-"""Compared pixels across, and mean of q in noise levels, of a patch that shows something new.  An edge that wanders
-fills half of it."""
 _BESIDE = 3
 """Compared pixels up to which a new reading may go on with an old one; without, one frame in
 twenty of a still scene has a patch that looks new."""
@@ -75,32 +63,17 @@ _BLOCK = 8
 """Compared pixels across which noise may be shared."""
 _QUARTILE = 1.15
 """Three quarters of normal noise lie below this many standard deviations."""
-_REACH = 1.25
-"""Factor on the farthest object's depth: beyond, where tables graze and walls are far, readings come and go."""
-_NOISIER, _SHARED = 5.0, 25.0
-"""Factor on a reading's noise, and v: more is no noise, and the camera has moved.  Still scenes had up to 3.5 and
-17."""
-_ANEW = {Status.CONVERGED: 30, Status.WEAK: 10, Status.FAILED: 30}
-"""Repetitions after which a body's turn comes: a second at 30 Hz.  Chosen."""
-_OLD = 30
-"""Frames after which segments are found anew when a body's turn comes: a second at 30 Hz.  Chosen."""
-_ALIKE = 0.8
-"""Intersection over union of two segments that are one: what noise leaves of a small object's edge."""
+_ANEW = 30
+"""Repetitions after which the turn of a body comes, of a weak one after a third of them, and age of segments that are
+then found anew: a second at 30 Hz."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reference:
     """A frame's recovery, and what it was made from: what the next frame is compared with.
 
-    Attributes
-    ----------
-    recovery
-        What the frame came to.
-    depth : float32 (rows, columns)
-        Every ``stride``-th pixel of the image, 0 where nothing was measured: for each body, as it was when that was
-        recovered.
-    segmentation
-        The objects, of all pixels, found ``age`` frames ago, or ``given``.
+    ``depth``: float32 (rows, columns), every ``stride``-th pixel of the image, 0 where nothing was measured: for each
+    body, as it was when that was recovered.  ``segmentation``: the objects, found ``age`` frames ago, or ``given``.
     """
 
     recovery: FrameRecovery
@@ -115,15 +88,7 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class Repeated:
-    """What a frame repeats of the frame before.
-
-    Attributes
-    ----------
-    bodies
-        Bodies that still hold, by their label in the frame before.
-    segmentation
-        That of the frame before, where its segments repeat; None where they have to be found.
-    """
+    """What a frame repeats of the one before: ``bodies`` by their label there, and the ``segmentation`` if it holds."""
 
     bodies: Mapping[int, Recovery]
     segmentation: FrameEvidence | None
@@ -133,14 +98,9 @@ NOTHING = Repeated({}, None)
 
 
 class StillScene:
-    """Recovers the frames of one camera, and takes from the frame before what did not change.
+    """Recovers the frames of one camera, and takes from the frame before, ``last``, what did not change.
 
-    Parameters
-    ----------
-    recoverer
-        What recovers the rest; several scenes may share it.
-    last
-        What to compare the first frame with, if there is something.
+    Several scenes may share the ``recoverer``.
     """
 
     def __init__(self, recoverer: Recoverer, last: Reference | None = None) -> None:
@@ -202,7 +162,8 @@ def repeat(last: Reference, readings: Readings) -> Repeated:
     if compared is None:
         return NOTHING
     change, patches, level, share = compared
-    still = float(np.abs(cv2.blur(patches, (_PATCH, _PATCH))).max()) < _NEW
+    # An edge that wanders fills half of a patch of 7 x 7.
+    still = float(np.abs(cv2.blur(patches, (7, 7))).max()) < 3.5
     smooth = cv2.blur(old, (3, 3))
 
     due, boxes = _due(previous.bodies), extents(shown)
@@ -213,18 +174,20 @@ def repeat(last: Reference, readings: Readings) -> Repeated:
         window = window_of(boxes[body.label], _BAND)
         own = shown[window] == body.label
         had = own & (old[window] > 0)
-        if np.count_nonzero(had & (new[window] > 0)) <= _MOST * np.count_nonzero(had):
+        # What is taken away where nothing is behind it, or comes too near, is not measured any more.
+        if np.count_nonzero(had & (new[window] > 0)) <= 0.5 * np.count_nonzero(had):
             continue
         seen = (np.ascontiguousarray(image[window]) for image in (change, old, new, smooth))
         sums, square = _moments(_around(own), level, *seen)
         square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
-        if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:
+        # T is above 30 once in 5000 by chance, once in 50 at the edges of simulated sensors.
+        if square.any() and sums @ np.linalg.solve(square, sums) < 30:
             repeating += 1
             if body is not due and CUT_SHORT not in body.message:
                 kept[body.label] = body
     count = len(previous.bodies)
     is_same = not last.given if labels is None else np.array_equal(labels, previous.labels)
-    is_fresh = len(kept) == count or last.age < _OLD
+    is_fresh = len(kept) == count or last.age < _ANEW
     repeats = is_same and still and 0 < count == repeating and is_fresh
     return Repeated(kept, last.segmentation if repeats else None)
 
@@ -237,15 +200,16 @@ def _compare(
     ``shown`` are the labels of the old one, and ``sigma`` is its noise at one metre.  Returns q (rows, columns),
     clipped, what patches are taken of (rows, columns), the noise level s, and v.
     """
-    reach = _REACH * float(old[shown > 0].max(initial=0))
+    # A fourth behind the farthest object and beyond, where tables graze and walls are far, readings come and go.
+    reach = 1.25 * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
     spread = select(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
-    if spread > _NOISIER * sigma:
+    if spread > 5 * sigma:  # still scenes have up to 3.5
         return None
     level = max(spread, 0.5 * sigma)
     patches, sums = _in_noise_levels(change, old, new, level, reach)
     share = max((select(sums, 3 * sums.size // 4) / _QUARTILE / _BLOCK) ** 2, 1.0) if sums.size else 1.0
-    return None if share > _SHARED else (change, patches, level, share)
+    return None if share > 25 else (change, patches, level, share)  # still scenes have up to 17
 
 
 def match(kept: Repeated, labels: np.ndarray, found: Found) -> dict[int, Recovery]:
@@ -261,7 +225,8 @@ def match(kept: Repeated, labels: np.ndarray, found: Found) -> dict[int, Recover
         counts[0] = 0
         label = int(counts.argmax())
         body = kept.bodies.get(label)
-        if body is not None and counts[label] > _ALIKE * (body.pixels + obj.pixels - counts[label]):
+        # Noise at the edge of a small object leaves an intersection over union of 0.8.
+        if body is not None and counts[label] > 0.8 * (body.pixels + obj.pixels - counts[label]):
             same[obj.label] = replace(body, label=obj.label, pixels=obj.pixels, repeats=body.repeats + 1)
     return same
 
@@ -271,7 +236,7 @@ def sample(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
 
     The image is NaN where nothing was measured, the readings are 0 there.
     """
-    stride = max(1, round(camera.width / _WIDTH))
+    stride = max(1, round(camera.width / 320))  # with so many columns neighbouring noise is alike in all sensors
     seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
     return np.where(np.isnan(seen), np.float32(0), seen), stride
 
@@ -291,8 +256,12 @@ def _around(mask: np.ndarray) -> np.ndarray:
 
 def _due(bodies: Sequence[Recovery]) -> Recovery | None:
     """The body whose turn it is to be recovered anew, if any."""
-    waiting = [body for body in bodies if body.repeats >= _ANEW[body.status]]
-    return max(waiting, key=lambda body: body.repeats - _ANEW[body.status], default=None)
+
+    def overdue(body: Recovery) -> int:
+        return body.repeats - (_ANEW // 3 if body.status == Status.WEAK else _ANEW)
+
+    longest = max(bodies, key=overdue, default=None)
+    return longest if longest is not None and overdue(longest) >= 0 else None
 
 
 @kernel

@@ -1,10 +1,8 @@
 """Recover frames in several processes and return the results in order; and many images of one object each.
 
-Each process has a Recoverer with one thread.  A few frames per process are under way at a time, which bounds memory.
-If a process dies (killed, or out of memory), another one starts and its frame is tried again, a few times.
-
-Each process has a pipe of its own.  Those of :class:`concurrent.futures.ProcessPoolExecutor` share one: a process that
-is killed while it writes an answer leaves all the others, and their caller, waiting for ever.
+Each process has a Recoverer with one thread, and a few frames under way, which bounds memory.  If a process dies
+(killed, or out of memory), another one starts and its frame is tried again, a few times.  Each has a pipe of its own:
+those of :class:`concurrent.futures.ProcessPoolExecutor` share one, and wait for ever if one is killed while it writes.
 """
 
 from __future__ import annotations
@@ -27,11 +25,6 @@ import numpy as np
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-
-AHEAD = 3
-"""Frames under way for each process: the one it works on, one that waits for it, one whose answer waits."""
-TRIES = 3
-"""Deaths of its process after which a frame is given up: one may be an operator's, or another frame's memory."""
 
 _Key = TypeVar("_Key")
 _Answer: TypeAlias = "Future[FrameRecovery | None]"
@@ -79,7 +72,7 @@ def recover_all(
                 return key, _unpack(answer.result())
             except _LostError:
                 deaths += 1
-                if deaths == TRIES:
+                if deaths == 3:  # one may be an operator's, or another frame's memory
                     return key, WorkerLostError("the process that recovered it died, again and again")
                 answer = begun(work)
             except Exception as error:  # whatever it raised there is for the caller
@@ -88,7 +81,8 @@ def recover_all(
     try:
         for key, work in frames:
             under_way.append((key, work, begun(work)))
-            while under_way and (len(under_way) >= AHEAD * executor.size or under_way[0][2].done()):
+            # For each process the frame it works on, one that waits for it, and one whose answer waits.
+            while under_way and (len(under_way) >= 3 * executor.size or under_way[0][2].done()):
                 yield first()
         while under_way:
             yield first()

@@ -42,29 +42,24 @@ class StageRanges:
     """Shares of the cameras that have a stage, and the ranges of its parameters."""
 
     temporal: float = 0.2
-    frames: tuple[int, int] = (2, 4)
-    """A still scene: with the default of a = 0.4, four frames weigh 87 %."""
+    frames: tuple[int, int] = (2, 4)  # a still scene: with the default of a = 0.4, four frames weigh 87 %
     decimation: float = 0.1
     spatial: float = 0.45
-    factor: tuple[float, float] = (0.25, 1.0)
-    """a, of both filters; librealsense: 0.25 to 1, by default 0.5."""
+    factor: tuple[float, float] = (0.25, 1.0)  # a, of both filters; librealsense: 0.25 to 1, by default 0.5
     threshold: tuple[float, float] = (1.0, 50.0)
     """d, in steps of disparity of 1/32 pixel; librealsense: 1 to 50, by default 20."""
-    rounds: tuple[int, int] = (1, 5)
-    """librealsense: 1 to 5, by default 2."""
+    rounds: tuple[int, int] = (1, 5)  # librealsense: 1 to 5, by default 2
     disparity: tuple[float, float] = (15.0, 80.0)
     """f b, pixels times metres, by which steps are counted: 21 for a D435 at 848 x 480, 87 for a D455 at 1280 x 720."""
     ring: float = 0.45
-    outer: tuple[int, int] = (1, 6)
-    """Pixels."""
+    outer: tuple[int, int] = (1, 6)  # pixels
     both_sides: float = 0.2
     """Share of the rings that cost the near side readings too.  What a second eye does not see, or a window mixes with
     what is nearer, is behind; mixed pixels of time of flight are on both sides."""
     inner: tuple[int, int] = (1, 2)
     edge: tuple[float, float] = (0.02, 0.08)
     """Step in depth from pixel to pixel beside which readings are lost, as a share of the depth."""
-    foot: float = 0.5
-    """Share of the rings that go around the whole thing, its foot too, where no step is."""
+    foot: float = 0.5  # share of the rings that go around the whole thing, its foot too, where no step is
     filling: float = 0.15
     alignment: float = 0.25
     baseline: tuple[float, float] = (0.01, 0.06)
@@ -72,12 +67,10 @@ class StageRanges:
     focal: tuple[float, float] = (0.65, 1.15)
     """Focal length of the sensor over that of the colour camera: D435 424 / 615, Kinect v1 580 / 525."""
     bend: float = 0.5
-    slope: float = 0.02
-    """Largest k and q: a table is bent by 1 to 2 % of the depth over half an image."""
+    slope: float = 0.02  # largest k and q: a table is bent by 1 to 2 % of the depth over half an image
     median: float = 0.15
     rounding: float = 0.5
-    steps: tuple[float, ...] = (0.0001, 0.001, 0.001, 0.01)
-    """Metres; whole millimetres are the rule (REP 118)."""
+    steps: tuple[float, ...] = (0.0001, 0.001, 0.001, 0.01)  # metres; whole millimetres are the rule (REP 118)
     blocks: float = 0.08
     quality: tuple[float, float] = (2e-4, 4e-3)
     """Quantum of the blocks' mean, per metre, of 8 to 12 bits for depths from half a metre on."""

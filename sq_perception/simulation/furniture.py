@@ -38,8 +38,7 @@ from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable
 class _Place:
     """The smallest rectangle around all objects along some direction, and a margin."""
 
-    axes: np.ndarray
-    """(3, 3), columns: along its sides, and up. The second one leads away from the camera."""
+    axes: np.ndarray  # (3, 3), columns: along its sides, and up. The second one leads away from the camera
     middle: np.ndarray  # (3,), on the plane that objects stand on
     half: np.ndarray  # (2,), half its sides
     height: float  # height of the highest object, metres

@@ -23,7 +23,6 @@ THINGS = {
     "soap": ((0.095, 0.060, 0.035), (0.3, 0.3), (-0.06, -0.11), -35.0),
 }
 """Full edges, exponents, place on the table and turn of each object."""
-SENSOR = "realsense_d435"
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,5 +50,5 @@ def sample(seed: int = 0) -> Sample:
         turn = quaternions.from_matrix(table @ turn_about_up(np.deg2rad(degrees)))
         bodies.append(Superquadric(size, np.array(shape), centre, turn))
     scene = Scene(Superquadric.stack(bodies), TABLE_CAMERA, np.append(up, -up @ looked_at))
-    depth = preset(SENSOR).measure(scene.render()[0], scene.camera, np.random.default_rng(seed))
+    depth = preset("realsense_d435").measure(scene.render()[0], scene.camera, np.random.default_rng(seed))
     return Sample(depth.astype(np.float32), scene.camera, scene.bodies, tuple(THINGS))

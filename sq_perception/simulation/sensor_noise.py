@@ -133,8 +133,7 @@ class Triangulation(SensorNoise):
     far: float  # metres; readings nearer or farther are missing
     edge_wander: float  # pixels, standard deviation of the place of an edge, in both directions, at normal incidence
     grazing: float
-    blind: float
-    """Degrees of incidence up to which (grazing) no reading is lost, and from which on (blind) all are."""
+    blind: float  # degrees of incidence up to which (grazing) no reading is lost, and from which on (blind) all are
 
     def __post_init__(self) -> None:
         check(self, focal=(1e-3, np.inf), baseline=(-np.inf, np.inf), step=(0.0, np.inf), near=(1e-3, np.inf))
@@ -214,7 +213,7 @@ class StructuredLight(Triangulation):
         sigma = 0.0012 + 0.0019 (z - 0.4)^2 + 0.0001 / sqrt(z) theta^2 / (pi/2 - theta)^2,
 
     and edges that wander by edge_wander + 0.035 theta / (pi/2 - theta) pixels.  They use the last term of sigma beyond
-    60 degrees only, where it is 0.4 mm at 1 m; here it holds everywhere, so that nothing jumps.
+    60 degrees only.
     """
 
     def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray:

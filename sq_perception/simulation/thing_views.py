@@ -1,8 +1,6 @@
 """Canonical views of household objects as cameras see them, with the support function of their hulls: training data.
 
-Each view is what :func:`canonical_view.from_mask` makes of a small pinhole image of the object on its table, after a
-sensor measured it: what a network is trained on is made by the code that it will be used with.  The image is drawn as
-follows.
+Each view is what :func:`canonical_view.from_mask` makes of a small pinhole image of the object on its table:
 
     setting     pose, camera and what is around the object: :mod:`sq_perception.simulation.thing_setting`
     before it   in some images something nearer, which comes in from one side
@@ -44,7 +42,6 @@ _PIXELS = 64
 PROCESSED = 0.5
 """Share of the views whose depth passes through random stages after the sensor; few drawn cameras have none at all."""
 _LEAST_SEEN = 40
-_OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +105,8 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
             continue
         view = canonical_view.from_mask(measured, mask, camera, _PIXELS, plane=plane, missing_is_hidden=True)
         reach = support_in_view(setting.parts, view)
-        if np.abs(reach).max() > 3.0 or (reach + reach[_OPPOSITE]).max() < 0.6:
+        widths = reach + reach[np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)]  # with the opposite directions
+        if np.abs(reach).max() > 3.0 or widths.max() < 0.6:
             continue
         return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {attempts} attempts")

@@ -1,11 +1,8 @@
 """Canonical views of known bodies, rendered directly without an image: the source of training data.
 
 The views equal those that :mod:`sq_perception.imaging.canonical_view` makes of images: rays along z on the view's own
-grid, fitted to the visible part of the body.  Frames and values are those of that module.
-
-A canonical view is orthographic for any camera, but a pinhole camera sees less of a body: of a convex one only points
-whose normals point to the camera.  So the rays along z, without those that meet a point facing away from the camera,
-show the same as the view of an image of any resolution.
+grid, fitted to the visible part of the body.  A pinhole camera sees less of a body, of a convex one only points whose
+normals point to it: rays that meet others are left out.
 """
 
 from __future__ import annotations

@@ -10,8 +10,7 @@ A consumer gets each body in the optical frame of its frame and in the form that
 | wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
 
 So a body that a hand moves is published no farther from where the frame shows it than four deviations of that one
-observation, and nothing is published that the frame does not show.  A single observation of other sizes in the same
-place is taken for an error and left out.
+observation.  A single observation of other sizes in the same place is taken for an error and left out.
 
 Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
 FIRST_FAILED_ID + its label, which no track reaches.
@@ -46,8 +45,7 @@ class Followed:
     seen: int  # number of frames that showed the body, this one included
     is_fused: bool  # whether the numbers are the track's; otherwise they are this frame's own
     superquadric: Superquadric  # a single body in the optical frame
-    covariance: np.ndarray
-    """(11, 11), as in :class:`~sq_perception.tracking.state.Observed`; NaN if the observation's is unknown."""
+    covariance: np.ndarray  # (11, 11), as in Observed; NaN if the observation's is unknown
     cavity: Any = None
     """That of the observation, if it has one; else the one seen last, unless the camera looks into it and sees none."""
 
@@ -76,12 +74,9 @@ class TrackingSession:
         """What follows frames without a pose, by the last one known: a copy, as where their bodies are is a guess."""
         self._stamp = -np.inf
         self._pose = state.parse_pose(None)
-        self._cavities: dict[int, Any] = {}
-        """The last cavity of each track, in the frame of its body."""
-        self.tally = Tally()
-        """Counts after the last frame; may be read from another thread."""
-        self.tracks: tuple[Track, ...] = ()
-        """All tracks after the last frame, in the world."""
+        self._cavities: dict[int, Any] = {}  # the last cavity of each track, in the frame of its body
+        self.tally = Tally()  # counts after the last frame; may be read from another thread
+        self.tracks: tuple[Track, ...] = ()  # all tracks after the last frame, in the world
 
     @property
     def hidden(self) -> tuple[int, ...]:

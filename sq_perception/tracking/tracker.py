@@ -83,8 +83,7 @@ class Tracker:
     def __init__(self) -> None:
         self._bodies: _Bodies = ()
         self._stamp: float | None = None
-        self.births = 0
-        """Ids given so far."""
+        self.births = 0  # ids given so far
 
     def reset(self) -> None:
         """Forget every body; ids go on."""

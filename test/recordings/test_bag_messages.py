@@ -69,14 +69,16 @@ def test_the_bytes_are_those_that_rclpy_makes(kind):
 def test_constants_are_those_of_ros():
     """Written out where they are needed, so that reading superquadrics takes NumPy alone."""
     field, marker = (TYPES.types[f"{name}"] for name in ("sensor_msgs/msg/PointField", "visualization_msgs/msg/Marker"))
-    from sq_msgs_py import markers as module
+    from sq_msgs_py.markers import markers
 
     names = {"i1": "INT8", "u1": "UINT8", "i2": "INT16", "u2": "UINT16", "i4": "INT32", "u4": "UINT32"}
     names |= {"f4": "FLOAT32", "f8": "FLOAT64"}
     assert {getattr(field, names[kind]): kind for kind in names} == columns._NUMPY_TYPES
     assert {kind for _, kind in FIELDS} == {field.FLOAT32, field.UINT32}
-    assert (module._TRIANGLE_LIST, module._LINE_LIST) == (marker.TRIANGLE_LIST, marker.LINE_LIST)
-    assert (module._ADD, module._DELETE_ALL) == (marker.ADD, marker.DELETEALL)
+    mesh = np.eye(3), np.array([[0, 1, 2]]), np.zeros((1, 2, 3))
+    first, surface, lines = markers([mesh], [1], header(result_bag.types), types=result_bag.types).markers
+    assert (first.action, surface.action, lines.action) == (marker.DELETEALL, marker.ADD, marker.ADD)
+    assert (surface.type, lines.type) == (marker.TRIANGLE_LIST, marker.LINE_LIST)
 
 
 def test_a_recorded_cloud_is_read_by_the_code_that_reads_a_live_one(rng):
