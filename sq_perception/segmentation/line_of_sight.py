@@ -33,15 +33,8 @@ LEAST_SAMPLES = 4
 """Fewest samples of a segment: six pairs."""
 _LEAST_GAP = 0.005
 """Metres that a crossed line lies before what was seen."""
-_HOLLOW = 0.125
-"""Share of ``noise`` by which the inside of a vessel lies behind its own lines, on average."""
-_LEAST_AREA, _NEAR = 1.6e-3, 0.85
-"""A body that shows less, square metres across the line of sight at so many metres and farther, and is attached to
-another, is a part of that; nearer, at the same angle."""
 _STEPS = 16
 """Steps in which a line is walked: gaps between round things that touch are narrow."""
-_FINE_STEPS = 24
-"""Steps of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
 _SHARE = 0.01
 """Share of the depth beyond which the least distance behind a line does not go."""
 _HOME = 0.1
@@ -52,11 +45,6 @@ def stride(pixels: int, count: int) -> int:
     """The stride of a grid that takes about ``count`` of so many pixels, at most twice as many."""
     step = max(1, math.isqrt(pixels // count))
     return step + 1 if pixels > 2 * count * step**2 else step
-
-
-def least_area(z: float) -> float:
-    """The least area that a body attached to another shows at a depth, square metres across the line of sight."""
-    return _LEAST_AREA * min(1.0, z / _NEAR) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,12 +113,6 @@ class SampledImage:
         pieces = [(rows[chosen == k], columns[chosen == k]) for k in range(int(group.max()) + 1)]
         return [piece for piece in pieces if len(piece[0])]
 
-    def is_inside(self, samples: Samples, group: np.ndarray) -> np.ndarray:
-        """Which groups of samples, numbers (n,) from 0, lie behind their own lines, as the inside of a vessel does."""
-        gap = _gaps(samples.pixels, samples.points, self.depth, self.labels)
-        means = [gap[np.ix_(group == k, group == k)].mean() for k in range(group.max() + 1)]
-        return np.array(means) > _HOLLOW * self.noise * samples.distance**2
-
 
 @inline_kernel
 def _crossed(
@@ -178,57 +160,6 @@ def between(
 
 
 @kernel
-def hidden(
-    pixels: np.ndarray, points: np.ndarray, ends: np.ndarray, names: np.ndarray, wanted: np.ndarray, depth: np.ndarray,
-    labels: np.ndarray, noise: float, least: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Two shares (n, n) of the lines between the samples of each two of n segments, labelled ``names`` (n,).
-
-    First that of the lines which leave one segment along its surface, pass behind a third one, and enter the other one
-    along its surface; then that of crossed lines.  For the ``wanted`` pairs, bool (n, n), by every second sample; 0 for
-    others.
-    """
-    n = len(names)
-    along, crossed = np.zeros((n, n)), np.zeros((n, n))
-    for a in range(n):
-        for b in range(a):
-            if not wanted[a, b]:
-                continue
-            lines, found, over = 0, 0, 0
-            for i in range(ends[a], ends[a + 1], 2):
-                if lines > 60 and found == 0:  # most pairs have nothing before them
-                    break
-                for j in range(ends[b], ends[b + 1], 2):
-                    lines += 1
-                    w0, w1 = 1.0 / points[i, 2], 1.0 / points[j, 2]
-                    on_a, on_b, behind, is_off = 0, 0, 0, False
-                    for k in range(1, _FINE_STEPS):
-                        t = k / _FINE_STEPS
-                        v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
-                        u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
-                        line = 1.0 / ((1 - t) * w0 + t * w1)
-                        beyond = np.float64(depth[v, u]) - line
-                        limit = max(noise * line * line, min(least, _SHARE * line))
-                        if beyond > limit:
-                            is_off = True
-                            over += 1
-                            break
-                        is_nearer = beyond < -limit
-                        if labels[v, u] == names[a]:
-                            on_a += 1
-                            is_off |= is_nearer
-                        elif labels[v, u] == names[b]:
-                            on_b += 1
-                            is_off |= is_nearer
-                        elif labels[v, u] > 0:
-                            behind += is_nearer
-                    found += not is_off and on_a > 0 and on_b > 0 and behind > 1
-            along[a, b] = along[b, a] = found / lines
-            crossed[a, b] = crossed[b, a] = over / lines
-    return along, crossed
-
-
-@kernel
 def _within(
     pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, noise: float, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -243,30 +174,6 @@ def _within(
             x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
             far[i, j] = far[j, i] = math.sqrt(x * x + y * y + z * z)
     return crossed, far
-
-
-@kernel
-def _gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """How far the surface lies behind the line between each pair of samples (n, n), metres, on average.
-
-    Taken where the line runs over the samples' own segment; 0 where it does not.
-    """
-    n = pixels.shape[0]
-    found = np.zeros((n, n))
-    for i in range(n):
-        own = labels[pixels[i, 0], pixels[i, 1]]
-        for j in range(i):
-            total, count = 0.0, 0
-            for k in range(2, _STEPS, 2):
-                t = k / _STEPS
-                v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
-                u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
-                if labels[v, u] == own and depth[v, u] > 0.0:
-                    total += np.float64(depth[v, u]) - 1.0 / ((1 - t) / points[i, 2] + t / points[j, 2])
-                    count += 1
-            if count > 0:
-                found[i, j] = found[j, i] = total / count
-    return found
 
 
 @kernel
