@@ -71,6 +71,7 @@ RULES: dict[str, dict[str, Any]] = {
     "pieces: as large near by (_CLOSE)": {f"{_S}.convex_parts._CLOSE": 1e-6},
     "pieces: nearest first (_METRIC)": {f"{_S}.convex_parts._METRIC": 0.0},
     "pieces: a step of 5 mm (_LEAST_GAP)": {f"{_S}.line_of_sight.SampledImage.__init__.__defaults__": (0.0,)},
+    "behind something nearer (_ALONG)": {f"{_S}.convex_parts._ALONG": 1.0},
     "network: a probability that it is a thing (LEAST)": {f"{_S}.objectness.LEAST": 0.0},
     "network: parts": {f"{_OWN}.SegmentNetwork._part": lambda *_: []},
     "network: a part claims itself (_ITSELF)": {f"{_OWN}._ITSELF": 0.0},

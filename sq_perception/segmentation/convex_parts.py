@@ -10,9 +10,12 @@ they touch is outvoted.
    lines as well.  Pixels go to the piece of the nearest sample; where near ones disagree, to the piece to which most
    lines are free.
 2. Neighbouring segments between which few pairs are crossed are one body.
+3. So are two segments that go on behind something nearer: lines leave the one along its surface, pass behind another
+   segment, and enter the other one along its surface.  A box behind a post is such; what is seen between two things
+   that stand apart is farther than the line.
 
-What is of one thing and not convex, as the inside of a vessel and its wall, or goes on behind something nearer, a
-network joins afterwards (:mod:`sq_perception.recovery.own_segments`).
+What is of one thing and not convex, as the inside of a vessel and its wall, a network joins afterwards
+(:mod:`sq_perception.recovery.own_segments`).
 
 Metres and pixels; depth is 0 where there is none.
 Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-of-sight, SGP 2013.
@@ -46,6 +49,8 @@ _AS_ONE = 0.3
 """Share of crossed pairs below which two segments are one body."""
 _NEAR = 0.03
 """Neighbouring segments are no farther apart, metres."""
+_ALONG = 0.15
+"""Share of lines that go along both surfaces, of two segments that are one behind a nearer one."""
 
 
 def correct(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
@@ -124,12 +129,19 @@ def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tupl
 
 
 def _crossed_between(image: SampledImage, parts: list[Samples], names: np.ndarray) -> np.ndarray:
-    """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,); inf where they are not near."""
+    """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,).
+
+    0 where two go on behind something nearer; inf where they are neither this nor near.
+    """
     pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
-    ends = np.cumsum([0] + [len(part.z) for part in parts])
+    together = pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
     beside = regions.beside(image.labels, image.depth, _NEAR)[np.ix_(names, names)]
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
-    return line_of_sight.between(pixels, points, ends, reach, beside, image.depth, image.noise, image.least)
+    crossed = line_of_sight.between(*together, reach, beside, image.depth, image.noise, image.least)
+    far = np.isinf(crossed)
+    along, over = line_of_sight.hidden(*together, names, far, image.depth, image.labels, image.noise, image.least)
+    crossed[far & (along > _ALONG) & (over < _AS_ONE)] = 0.0
+    return crossed
 
 
 def cluster(crossed: np.ndarray, far: np.ndarray, limit: float, least: float) -> np.ndarray:

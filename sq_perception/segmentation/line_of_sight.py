@@ -35,6 +35,8 @@ _LEAST_GAP = 0.005
 """Metres that a crossed line lies before what was seen."""
 _STEPS = 16
 """Steps in which a line is walked: gaps between round things that touch are narrow."""
+_FINE_STEPS = 24
+"""Steps of a line that passes behind something: a nearer thing of a tenth of it is met by two of them."""
 _SHARE = 0.01
 """Share of the depth beyond which the least distance behind a line does not go."""
 _HOME = 0.1
@@ -157,6 +159,57 @@ def between(
                     count += _crossed(p[0], p[1], points[i, 2], q[0], q[1], points[j, 2], depth, noise, least)
             share[a, b] = share[b, a] = count / lines
     return share
+
+
+@kernel
+def hidden(
+    pixels: np.ndarray, points: np.ndarray, ends: np.ndarray, names: np.ndarray, wanted: np.ndarray, depth: np.ndarray,
+    labels: np.ndarray, noise: float, least: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two shares (n, n) of the lines between the samples of each two of n segments, labelled ``names`` (n,).
+
+    First that of the lines which leave one segment along its surface, pass behind a third one, and enter the other one
+    along its surface; then that of crossed lines.  For the ``wanted`` pairs, bool (n, n), by every second sample; 0 for
+    others.
+    """
+    n = len(names)
+    along, crossed = np.zeros((n, n)), np.zeros((n, n))
+    for a in range(n):
+        for b in range(a):
+            if not wanted[a, b]:
+                continue
+            lines, found, over = 0, 0, 0
+            for i in range(ends[a], ends[a + 1], 2):
+                if lines > 60 and found == 0:  # most pairs have nothing before them
+                    break
+                for j in range(ends[b], ends[b + 1], 2):
+                    lines += 1
+                    w0, w1 = 1.0 / points[i, 2], 1.0 / points[j, 2]
+                    on_a, on_b, behind, is_off = 0, 0, 0, False
+                    for k in range(1, _FINE_STEPS):
+                        t = k / _FINE_STEPS
+                        v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
+                        u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
+                        line = 1.0 / ((1 - t) * w0 + t * w1)
+                        beyond = np.float64(depth[v, u]) - line
+                        limit = max(noise * line * line, min(least, _SHARE * line))
+                        if beyond > limit:
+                            is_off = True
+                            over += 1
+                            break
+                        is_nearer = beyond < -limit
+                        if labels[v, u] == names[a]:
+                            on_a += 1
+                            is_off |= is_nearer
+                        elif labels[v, u] == names[b]:
+                            on_b += 1
+                            is_off |= is_nearer
+                        elif labels[v, u] > 0:
+                            behind += is_nearer
+                    found += not is_off and on_a > 0 and on_b > 0 and behind > 1
+            along[a, b] = along[b, a] = found / lines
+            crossed[a, b] = crossed[b, a] = over / lines
+    return along, crossed
 
 
 @kernel

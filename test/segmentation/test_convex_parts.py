@@ -90,3 +90,30 @@ def test_nothing_to_say_changes_nothing(depth):
     np.testing.assert_array_equal(convex_parts.correct(labels, image, CAMERA, NOISE), labels)
     labels[50:100, 50:100] = 3
     np.testing.assert_array_equal(convex_parts.correct(labels, image, CAMERA, NOISE) > 0, labels > 0)
+
+
+def behind_a_post(tilt=0.0, between=0.5):
+    """Two parts of a board 0.7 m away, the right one turned by a tilt about its near edge, beside what is between."""
+    depth, labels = np.full((CAMERA.height, CAMERA.width), 1.5), np.zeros((CAMERA.height, CAMERA.width), np.int32)
+    v, u = np.indices(depth.shape)
+    x = (u - CAMERA.cx) / CAMERA.fx
+    parts = [(u > 90) & (u < 140), (u > 180) & (u < 230), (u >= 140) & (u <= 180)]
+    start = (180 - CAMERA.cx) / CAMERA.fx * 0.7
+    # A point (x z, y z, z) of the turned part: z - 0.7 = tan(tilt) (x z - start).
+    turned = (0.7 - np.tan(tilt) * start) / (1 - np.tan(tilt) * x)
+    for k, (where, z) in enumerate(zip(parts, (0.7, turned, between), strict=True)):
+        here = where & (v > 80) & (v < 160)
+        depth, labels = np.where(here, z, depth), np.where(here, k + 1, labels)
+    return depth.astype(np.float32), labels.astype(np.int32)
+
+
+def of_parts(depth, labels, **options):
+    found = convex_parts.correct(labels, depth, CAMERA, NOISE, **options)
+    return [found[120, u] for u in (115, 205, 160)]
+
+
+def test_a_board_goes_on_behind_what_is_nearer():
+    left, right, post = of_parts(*behind_a_post())
+    assert left == right != post
+    assert len(set(of_parts(*behind_a_post(tilt=0.5)))) == 3, "they are two faces"
+    assert len(set(of_parts(*behind_a_post(between=0.9)))) == 3, "the gap shows what lies behind"
