@@ -61,7 +61,6 @@ _S = "sq_perception.segmentation"
 _OWN = "sq_perception.recovery.own_segments"
 RULES: dict[str, dict[str, Any]] = {
     "plane: things are near above it (_TYPICAL_HEIGHT)": {f"{_S}.support_plane._FAR": 1.0},
-    "support: bent": {f"{_S}.support_plane._DISTORTION": 0.0},
     "the silhouette of a single thing": {f"{_S}.segments._is_silhouette": lambda *_: False},
     "level tops (level_faces)": {f"{_S}.level_faces.find_faces": lambda *_: {}},
     "walls of containers (container_walls)": {f"{_S}.container_walls.walls": lambda *_: set()},
