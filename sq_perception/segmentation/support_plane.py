@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import deviation, quantile
+from sq_perception.geometry.quantiles import deviation
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 
