@@ -7,6 +7,7 @@
 | room | a table that ends, and what stands on the floor behind it |
 | floor | small things on the floor of a room, beside what is larger than a thing, seen by a robot's camera |
 | heap | 20 to 60 bodies of 4 to 7 cm that touch |
+| near | 5 to 24 bodies of 2 to 3.5 cm that touch, 0.28 to 0.45 m before a wrist camera |
 | crowd | up to twelve superquadrics that touch |
 | carton, stool, shelf board, shelves, tray, bin | things in and on :mod:`sq_perception.simulation.furniture` |
 | nothing | a table and the room behind it, and no thing |
@@ -170,19 +171,26 @@ def _flat(rng: np.random.Generator, camera: Camera) -> _Drawn:
     return _rendered(rows, look, eye, camera, len(rows), rng.uniform(1.8, 3.5))
 
 
-def _heap(rng: np.random.Generator, camera: Camera) -> _Drawn:
-    look, eye = _view(rng, (45.0, 80.0), rng.uniform(0.7, 1.0))
-    wanted, rows, circles = int(rng.integers(20, 61)), [], []
-    spread = 0.025 * np.sqrt(wanted)
-    for _ in range(4000):
-        half = rng.uniform(0.02, 0.035, 3)
-        at, radius = rng.uniform(-spread, spread, 2), float(half[:2].min()) * rng.uniform(1.0, 1.2)
-        if _apart(circles, at, radius):
-            rows.append(_upright(half, rng.uniform(0.1, 1.0, 2), at, rng.uniform(0, np.pi)))
-            circles.append((at, radius))
-        if len(rows) == wanted:
-            break
-    return _rendered(rows, look, eye, camera, len(rows), rng.uniform(1.8, 3.5))
+def _heap(
+    halves: tuple[float, float], number: tuple[int, int], distances: tuple[float, float], elevation: float
+) -> Callable[[np.random.Generator, Camera], _Drawn]:
+    """Bodies that touch: their half sizes, how many, at what distances, seen from so many degrees and more."""
+
+    def drawn(rng: np.random.Generator, camera: Camera) -> _Drawn:
+        look, eye = _view(rng, (elevation, 80.0), rng.uniform(*distances))
+        wanted, rows, circles = int(rng.integers(*number)), [], []
+        spread = 1.25 * halves[0] * np.sqrt(wanted)
+        for _ in range(4000):
+            half = rng.uniform(*halves, 3)
+            at, radius = rng.uniform(-spread, spread, 2), float(half[:2].min()) * rng.uniform(1.0, 1.2)
+            if _apart(circles, at, radius):
+                rows.append(_upright(half, rng.uniform(0.1, 1.0, 2), at, rng.uniform(0, np.pi)))
+                circles.append((at, radius))
+            if len(rows) == wanted:
+                break
+        return _rendered(rows, look, eye, camera, len(rows), rng.uniform(1.8, 3.5))
+
+    return drawn
 
 
 def _floor(rng: np.random.Generator, camera: Camera) -> _Drawn:
@@ -213,8 +221,9 @@ KINDS: dict[str, Callable[[np.random.Generator, Camera], _Drawn]] = {
     "flat": _flat,
     "room": _with_room,
     "floor": _floor,
-    "heap": _heap,
+    "heap": _heap((0.02, 0.035), (20, 61), (0.7, 1.0), 45.0),
     "crowd": _crowd,
     **{name: _in_furniture(name) for name in furniture.KINDS},
     "nothing": _nothing,
+    "near": _heap((0.01, 0.0175), (5, 25), (0.28, 0.45), 35.0),
 }

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
 
@@ -127,28 +126,18 @@ def _extents(labels: np.ndarray, count: int) -> np.ndarray:
     return found
 
 
-def borders(
-    labels: np.ndarray, depth: np.ndarray, count: int, near: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How often each two of the labels 0 to ``count`` are next to each other along the rows and the columns of an
-    image, across pixels without a depth (0); the image's border is of label 0.
-
-    Returns three numbers of contacts (count + 1, count + 1): of all; of those at which the two are less than ``near``
-    metres apart along the line of sight, 0 for label 0; of those at which a (row) is farther than b (column) by a depth
-    step.
-    """
+def beside(labels: np.ndarray, depth: np.ndarray, near: float) -> np.ndarray:
+    """Which two of the labels of an image are next to each other along a row or a column, across pixels without a
+    depth (0), and less than ``near`` metres apart along the line of sight: bool (n, n) by label; none is beside 0."""
     labels = np.ascontiguousarray(labels, dtype=np.int32)
-    met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near)
-    return met + met.T, beside + beside.T, behind
+    found = _beside(labels, np.ascontiguousarray(depth, dtype=np.float32), int(labels.max()) + 1, near)
+    return np.asarray(found | found.T)
 
 
 @kernel
-def _borders(
-    labels: np.ndarray, depth: np.ndarray, count: int, near: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As :func:`borders`; each contact is entered once in ``met`` and ``beside``, for one of the two orders."""
-    n = count + 1
-    met, beside, behind = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+def _beside(labels: np.ndarray, depth: np.ndarray, count: int, near: float) -> np.ndarray:
+    """As :func:`beside`, for one of the two orders of each pair."""
+    found = np.zeros((count, count), np.bool_)
     # The last pixel with a depth in each column, and in this row.
     above, above_z = np.zeros(labels.shape[1], np.int32), np.zeros(labels.shape[1], np.float32)
     for v in range(labels.shape[0]):
@@ -158,16 +147,8 @@ def _borders(
             if z > 0:
                 here = labels[v, u]
                 for other, other_z in ((left, left_z), (above[u], above_z[u])):
-                    if other != here:
-                        met[other, here] += 1
-                        if other > 0 and here > 0:
-                            apart = abs(other_z - z)
-                            beside[other, here] += apart < near
-                            if depth_steps.STEP * min(other_z, z) < apart:
-                                behind[(other, here) if other_z > z else (here, other)] += 1
+                    if other != here and other > 0 and here > 0 and abs(other_z - z) < near:
+                        found[other, here] = True
                 left = above[u] = here
                 left_z = above_z[u] = z
-        met[left, 0] += left != 0
-    for u in range(labels.shape[1]):
-        met[above[u], 0] += above[u] != 0
-    return met, beside, behind
+    return found

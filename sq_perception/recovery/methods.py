@@ -19,6 +19,7 @@ from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.seen_object import SeenObject, surroundings
+from sq_perception.segmentation import objectness
 
 
 def fit_view(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
@@ -82,6 +83,22 @@ def widen(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
     if not is_open:
         return replace(fit, covariance=covariance)
     return replace(fit, covariance=covariance, status=Status.WEAK, message="it may go on in what is next to it")
+
+
+def judge(likely: float, fit: Fit, pixels: float, larger: Iterable[tuple[float, Fit]]) -> float:
+    """The probability that an object is a thing once its body is known (:func:`objectness.posterior`).
+
+    ``larger`` are the affinity to each object with more pixels, and its fit; the surest of them may be the thing that
+    this one is a fragment of.
+    """
+    body, others = fit.superquadric, [(q, each) for q, each in larger if each.status != Status.FAILED]
+    affinity, whole = max(others, key=lambda other: other[0], default=(0.0, None))
+    overlap = 0.0
+    if whole is not None:
+        eta, omega = np.meshgrid(np.linspace(-1.4, 1.4, 9), np.linspace(-np.pi, np.pi, 16, endpoint=False))
+        overlap = float((whole.superquadric.gauge(body.parametric_points(eta.ravel(), omega.ravel())) < 1).mean())
+    uncertainty = float(np.max(fit.sigma_size / body.size))
+    return objectness.posterior(likely, uncertainty, pixels, affinity, overlap)
 
 
 def _predict(obj: SeenObject) -> Fit:

@@ -200,11 +200,14 @@ class Recoverer:
                 scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], readings.options), range(len(fresh)))
         evidence = found.segmentation
         likely, fragments, fewest = evidence.objectness_by_label(), [], segments.least_pixels(evidence.labels.size)
+        shown = {label: body.fit for label, body in bodies.items()}
+        shown |= {obj.label: fit for obj, fit in zip(fresh, fits, strict=True)}
         for obj, fit, score, some in zip(fresh, fits, scores, made_of, strict=True):
             thing = likely[obj.label]
             if evidence.membership is not None and fit.status != Status.FAILED:
-                uncertainty = float(np.max(fit.sigma_size / fit.superquadric.size))
-                thing = objectness.posterior(thing, uncertainty, obj.pixels / fewest)
+                same, before = evidence.affinities(obj.label), [o for o in found.objects if o.pixels > obj.pixels]
+                larger = [(same.get(other.label, 0.0), shown[other.label]) for other in before]
+                thing = methods.judge(thing, fit, obj.pixels / fewest, larger)
                 if thing < objectness.LEAST_POSTERIOR:
                     fragments.append(obj.label)
                     continue

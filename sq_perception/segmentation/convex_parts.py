@@ -7,14 +7,15 @@ they touch is outvoted.
 1. A segment of whose pairs of samples many are crossed is taken apart: its samples are clustered by average linkage,
    the distance being the share of crossed pairs (and a little of the metric one, which orders those that nothing
    parts).  The pieces need not be convex themselves: a third body among them, a handle and smeared edges cross their
-   lines as well.  A vessel, whose inner wall lies behind its own lines, stays whole.  Pixels go to the piece of the
-   nearest sample; where near ones disagree, to the piece to which most lines are free.
-2. Neighbouring segments between which few pairs are crossed are one body; if one is a bit, up to nearly half of them.
-3. So are the inside of a vessel and its wall, of which the inside is a step behind the near rim: a hollow segment and
-   one before it, if a large share of the border of both is such a step.
-4. So are two segments that go on behind something nearer: lines leave the one along its surface, pass behind another
+   lines as well.  Pixels go to the piece of the nearest sample; where near ones disagree, to the piece to which most
+   lines are free.
+2. Neighbouring segments between which few pairs are crossed are one body.
+3. So are two segments that go on behind something nearer: lines leave the one along its surface, pass behind another
    segment, and enter the other one along its surface.  A box behind a post is such; what is seen between two things
    that stand apart is farther than the line.
+
+What is of one thing and not convex, as the inside of a vessel and its wall, a network joins afterwards
+(:mod:`sq_perception.recovery.own_segments`).
 
 Metres and pixels; depth is 0 where there is none.
 Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-of-sight, SGP 2013.
@@ -22,13 +23,15 @@ Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-o
 
 from __future__ import annotations
 
+from itertools import count
+
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import line_of_sight
-from sq_perception.segmentation.line_of_sight import LEAST_SAMPLES, SampledImage, Samples, least_area
+from sq_perception.segmentation.line_of_sight import LEAST_SAMPLES, SampledImage, Samples
 from sq_perception.segmentation.support_plane import CLEARLY
 
 _FEW, _MANY = 30, 160
@@ -39,15 +42,13 @@ _APART = 0.55
 """Share of crossed pairs, on average, between pieces of a segment: more than half, as between bodies that touch."""
 _METRIC = 0.3
 """What the metric distance adds to that between samples, at most."""
-_INSIDE = 0.15
-"""Share of a segment's samples that are insides, beyond which the segment is one vessel."""
-_AS_ONE, _BIT_AS_ONE = 0.3, 0.45
-"""Share of crossed pairs below which two segments are one body; and if one is a bit, too small to be a body beside the
-other: handles and what noise broke off."""
+_LEAST_PIECE, _CLOSE = 8e-4, 0.85
+"""A piece that shows less, square metres across the line of sight at so many metres and farther, is a part of what it
+is attached to; nearer, at the same angle."""
+_AS_ONE = 0.3
+"""Share of crossed pairs below which two segments are one body."""
 _NEAR = 0.03
 """Neighbouring segments are no farther apart, metres."""
-_RIM = 0.12
-"""Share of an inside's border that lies behind another segment, and of the border of that."""
 _ALONG = 0.15
 """Share of lines that go along both surfaces, of two segments that are one behind a nearer one."""
 
@@ -74,13 +75,11 @@ def correct(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float)
     # The one layout that kernels are compiled for; labels are written to.
     depth, labels = np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C")
     image = SampledImage(depth, labels, camera, CLEARLY * sigma)
-    rims = _rims(image)
-    parts, origin = _part(image)
-    number_of = np.arange(len(origin), dtype=np.int32)
+    parts = _part(image)
+    number_of = np.arange(labels.max() + 1, dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
-        crossed = _crossed_between(image, parts, names, origin, rims)
-        group = link(crossed, _AS_ONE)
+        group = link(_crossed_between(image, parts, names), _AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
     return regions.renumber(image.labels, number_of)
@@ -95,34 +94,24 @@ def warm_up() -> None:
     correct((radius < 1).astype(np.int32), depth, camera, 1e-3)
 
 
-def _rims(image: SampledImage) -> np.ndarray:
-    """Pairs (n, 2) of labels of which the first lies a depth step behind the second along a large share of the borders
-    of both."""
-    met, _, behind = regions.borders(image.labels, image.depth, int(image.labels.max()), _NEAR)
-    border = met.sum(axis=1)
-    return np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :]))
-
-
-def _part(image: SampledImage) -> tuple[list[Samples], np.ndarray]:
+def _part(image: SampledImage) -> list[Samples]:
     """Give the parts of segments that are several convex bodies labels of their own, in the image.
 
-    Returns samples of all segments and parts that are large enough to have some, and for each label the one of the
-    segment that it was a part of.
+    Returns samples of all segments and parts that are large enough to have some.
     """
     extents = regions.extents(image.labels)
-    origin = list(range(len(extents)))
     parts, new = {k: image.sample(k, extents[k], _FEW) for k in np.flatnonzero(extents[:, 0]).tolist()}, []
+    unused = count(len(extents))
     for label, part in parts.items():
         pieces = [] if part is None else _pieces(image, part, extents[label])
         new += [label] if pieces else []
         for rows, columns in pieces[1:]:
-            image.labels[rows, columns] = len(origin)
-            new.append(len(origin))
-            origin.append(label)
+            new.append(next(unused))
+            image.labels[rows, columns] = new[-1]
     if new:
         extents = regions.extents(image.labels)
         parts |= {k: image.sample(k, extents[k], _FEW) for k in new}
-    return [part for part in parts.values() if part is not None], np.array(origin)
+    return [part for part in parts.values() if part is not None]
 
 
 def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -130,57 +119,28 @@ def _pieces(image: SampledImage, part: Samples, extent: np.ndarray) -> list[tupl
 
     ``part`` are a few samples of it, ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
     """
-    least = least_area(part.distance) / 2  # of a piece: half of what a body that is attached to another shows
-    if part.area < 2 * least:
-        return []
-    if image.within(part)[0].mean() < _SUSPICIOUS:
+    least = _LEAST_PIECE * min(1.0, part.distance / _CLOSE) ** 2
+    if part.area < 2 * least or image.within(part)[0].mean() < _SUSPICIOUS:
         return []
     whole = image.sample(part.label, extent, _MANY)
     assert whole is not None  # no fewer than a few
-    crossed, far = image.within(whole)
-    group = cluster(crossed, far, _APART, max(LEAST_SAMPLES, least / whole.spacing**2))
-    if group.any():
-        group = _with_whole_vessels(group, image.is_inside(whole, group), far)
+    group = cluster(*image.within(whole), _APART, max(LEAST_SAMPLES, least / whole.spacing**2))
     return image.pieces(extent, whole, group, _MANY) if group.any() else []
 
 
-def _with_whole_vessels(group: np.ndarray, is_inside: np.ndarray, far: np.ndarray) -> np.ndarray:
-    """Groups (n,) of samples, from 0, with each inside joined to the nearest other one, by ``far`` (n, n), which is its
-    wall; one group where the segment is a vessel."""
-    inside = is_inside[group]
-    if np.count_nonzero(inside) > _INSIDE * len(group):
-        return np.zeros_like(group)
-    name = np.arange(len(is_inside))
-    for k in np.flatnonzero(is_inside):
-        name[k] = group[~inside][far[np.ix_(group == k, ~inside)].min(axis=0).argmin()]
-    return np.unique(name[group], return_inverse=True)[1]
-
-
-def _crossed_between(
-    image: SampledImage, parts: list[Samples], names: np.ndarray, origin: np.ndarray, rims: np.ndarray
-) -> np.ndarray:
+def _crossed_between(image: SampledImage, parts: list[Samples], names: np.ndarray) -> np.ndarray:
     """Share (n, n) of crossed lines between each two segments, labelled ``names`` (n,).
 
-    0 where two go on behind something nearer or are of one vessel; inf where they are neither these nor near.
+    0 where two go on behind something nearer; inf where they are neither this nor near.
     """
     pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
     together = pixels, points, np.cumsum([0] + [len(part.z) for part in parts])
-    borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR)
-    beside, behind = (each[np.ix_(names, names)] for each in borders[1:])
+    beside = regions.beside(image.labels, image.depth, _NEAR)[np.ix_(names, names)]
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
-    crossed = line_of_sight.between(*together, reach, beside > 0, image.depth, image.noise, image.least)
-    is_bit = np.array([part.area < least_area(part.distance) for part in parts])
-    crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= _AS_ONE / _BIT_AS_ONE
-    far = np.isinf(crossed) & ~(is_bit[:, None] & is_bit)
+    crossed = line_of_sight.between(*together, reach, beside, image.depth, image.noise, image.least)
+    far = np.isinf(crossed)
     along, over = line_of_sight.hidden(*together, names, far, image.depth, image.labels, image.noise, image.least)
     crossed[far & (along > _ALONG) & (over < _AS_ONE)] = 0.0
-    for inside, wall in rims.tolist():
-        vessel = np.flatnonzero(names == inside)
-        is_whole = len(vessel) == 1 and np.count_nonzero(origin == inside) == 1
-        if is_whole and image.is_inside(part := parts[vessel[0]], np.zeros(len(part.z), int))[0]:
-            before = behind[vessel[0]] * (origin[names] == wall)
-            vessel = np.append(vessel, np.flatnonzero(before > _RIM * before.sum()))
-            crossed[np.ix_(vessel, vessel)] = 0.0
     return crossed
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sq_perception.imaging import regions
 from sq_perception.segmentation.objectness import HeightEvidence
-from sq_perception.segmentation.support_plane import LEAST_SIGMA, SupportSurface
+from sq_perception.segmentation.support_plane import LEAST_SIGMA, Plane
 
 UNKNOWN_SIGMA = 1.5e-3
 """Noise of the depth at one metre, metres, where no support shows it: that of structured light (Khoshelham and Oude
@@ -32,8 +32,8 @@ class FrameEvidence:
         0 for background; own labels run from 1, largest object first, labels given from outside keep their values.
     ids : tuple of int
         Labels in the image, the one with most pixels first.
-    support : SupportSurface or None
-        The frame's support as the sensor shows it; None where there is none.
+    support : Plane or None
+        The frame's support, with the noise about it; None where there is none.
     objectness
         The probability, by ``ids``, that each is a thing; empty: 1, as for labels given from outside.
     membership : float32 (height, width) or None
@@ -50,7 +50,7 @@ class FrameEvidence:
 
     labels: np.ndarray
     ids: tuple[int, ...] = ()
-    support: SupportSurface | None = None
+    support: Plane | None = None
     objectness: tuple[float, ...] = ()
     membership: np.ndarray | None = None
     affinity: np.ndarray | None = None
@@ -62,7 +62,7 @@ class FrameEvidence:
     @property
     def plane(self) -> np.ndarray | None:
         """n and d (4,) of the support plane, height above it = n.p + d; None where there is none."""
-        return None if self.support is None else self.support.plane.equation
+        return None if self.support is None else self.support.equation
 
     @property
     def sigma(self) -> float:

@@ -22,7 +22,7 @@ from sq_perception.geometry.quantiles import densest, deviation, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.options import POINTS, TURNS, across
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, SupportSurface, flat_surface, noise_growth
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
 
 _LOWEST = 5.0
 """Tolerances above the support at which a face lies at least: lower ones are books and bumps."""
@@ -39,9 +39,9 @@ def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -
 
 
 def find_faces(
-    segments: Mapping[int, np.ndarray], labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface,
+    segments: Mapping[int, np.ndarray], labels: np.ndarray, depth: np.ndarray, camera: Camera, support: Plane,
     least: int,
-) -> dict[int, SupportSurface]:
+) -> dict[int, Plane]:
     """Find the level faces, as supports, of the segments that have one, and at least ``least`` pixels above it; in the
     order of ``segments``, samples of what stands on the ``support``."""
     extents, faces = regions.extents(labels), {}
@@ -49,18 +49,18 @@ def find_faces(
         if (face := _face(points, support)) is not None:
             pixels = regions.pixels(labels, label, extents[label])
             everything = camera.unproject(*pixels[::-1], depth[pixels])
-            off = face.plane.height(everything) / noise_growth(everything[:, 2])
+            off = face.height(everything) / noise_growth(everything[:, 2])
             if np.count_nonzero(off > face.clear_height) >= least:
                 faces[label] = face
     return faces
 
 
 def find_above(
-    label: int, points: np.ndarray, face: SupportSurface, labels: np.ndarray, depth: np.ndarray, camera: Camera
+    label: int, points: np.ndarray, face: Plane, labels: np.ndarray, depth: np.ndarray, camera: Camera
 ) -> np.ndarray:
     """Find the pixels (height, width) of a segment with a level face, known by its points (n, 3), and of all segments
     whose middle is right above it.  Other faces may have taken all pixels of the segment by now."""
-    axes = TURNS @ across(face.plane.equation[:3]).T
+    axes = TURNS @ across(face.equation[:3]).T
     low, high = (axes @ points.T).min(axis=1), (axes @ points.T).max(axis=1)
     is_over = np.zeros(int(labels.max()) + 1, bool)
     for other, some in samples(labels, depth, camera, 1).items():
@@ -69,10 +69,10 @@ def find_above(
     return is_over[labels]
 
 
-def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
+def _face(points: np.ndarray, support: Plane) -> Plane | None:
     """The level face that most points (n, 3) of a segment lie on; None where more of them are above it."""
     growth = noise_growth(points[:, 2])
-    height = support.plane.height(points)
+    height = support.height(points)
     reach = TOLERANCE * quantile(growth, 0.5)
     ordered = np.sort(height[height >= _LOWEST * reach])
     level = ordered[densest(ordered, reach)]
@@ -86,4 +86,4 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     if count < max(_LAYER * within, above):
         return None
     sigma = max(support.sigma, deviation(np.abs(off[on])))
-    return flat_surface(Plane(support.plane.equation - np.array([0, 0, 0, at]), count / len(points), sigma))
+    return Plane(support.equation - np.array([0, 0, 0, at]), count / len(points), sigma)

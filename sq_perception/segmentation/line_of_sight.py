@@ -33,11 +33,6 @@ LEAST_SAMPLES = 4
 """Fewest samples of a segment: six pairs."""
 _LEAST_GAP = 0.005
 """Metres that a crossed line lies before what was seen."""
-_HOLLOW = 0.125
-"""Share of ``noise`` by which the inside of a vessel lies behind its own lines, on average."""
-_LEAST_AREA, _NEAR = 1.6e-3, 0.85
-"""A body that shows less, square metres across the line of sight at so many metres and farther, and is attached to
-another, is a part of that; nearer, at the same angle."""
 _STEPS = 16
 """Steps in which a line is walked: gaps between round things that touch are narrow."""
 _FINE_STEPS = 24
@@ -52,11 +47,6 @@ def stride(pixels: int, count: int) -> int:
     """The stride of a grid that takes about ``count`` of so many pixels, at most twice as many."""
     step = max(1, math.isqrt(pixels // count))
     return step + 1 if pixels > 2 * count * step**2 else step
-
-
-def least_area(z: float) -> float:
-    """The least area that a body attached to another shows at a depth, square metres across the line of sight."""
-    return _LEAST_AREA * min(1.0, z / _NEAR) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +114,6 @@ class SampledImage:
         )
         pieces = [(rows[chosen == k], columns[chosen == k]) for k in range(int(group.max()) + 1)]
         return [piece for piece in pieces if len(piece[0])]
-
-    def is_inside(self, samples: Samples, group: np.ndarray) -> np.ndarray:
-        """Which groups of samples, numbers (n,) from 0, lie behind their own lines, as the inside of a vessel does."""
-        gap = _gaps(samples.pixels, samples.points, self.depth, self.labels)
-        means = [gap[np.ix_(group == k, group == k)].mean() for k in range(group.max() + 1)]
-        return np.array(means) > _HOLLOW * self.noise * samples.distance**2
 
 
 @inline_kernel
@@ -243,30 +227,6 @@ def _within(
             x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
             far[i, j] = far[j, i] = math.sqrt(x * x + y * y + z * z)
     return crossed, far
-
-
-@kernel
-def _gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    """How far the surface lies behind the line between each pair of samples (n, n), metres, on average.
-
-    Taken where the line runs over the samples' own segment; 0 where it does not.
-    """
-    n = pixels.shape[0]
-    found = np.zeros((n, n))
-    for i in range(n):
-        own = labels[pixels[i, 0], pixels[i, 1]]
-        for j in range(i):
-            total, count = 0.0, 0
-            for k in range(2, _STEPS, 2):
-                t = k / _STEPS
-                v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
-                u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
-                if labels[v, u] == own and depth[v, u] > 0.0:
-                    total += np.float64(depth[v, u]) - 1.0 / ((1 - t) / points[i, 2] + t / points[j, 2])
-                    count += 1
-            if count > 0:
-                found[i, j] = found[j, i] = total / count
-    return found
 
 
 @kernel

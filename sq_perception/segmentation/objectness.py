@@ -14,10 +14,11 @@ what the sensor's noise leaves of a mean of so many correlated readings, and the
 removes.  a, b, c are those of a logistic regression (see ``_WEIGHTS``).
 
 A fragment of a thing rises and looks like one as well; its finished body tells.  With p the probability above, u the
-largest standard deviation of a half size over that half size, 1 at most, and n the segment's pixels over the fewest
-that a segment has,
+largest standard deviation of a half size over that half size, 1 at most, n the segment's pixels over the fewest that a
+segment has, q the largest affinity to a segment with more pixels, and o the share of the body's surface within the body
+of that one,
 
-    logit P(thing | body) = a' logit p + b' log u + c' log n + d'
+    logit P(thing | body) = a' logit p + b' log u + c' log n + d' log q + e' o + f'
 
 Heights and deviations in metres as at one metre of depth.
 """
@@ -42,10 +43,10 @@ _UNASKED = 3.4
 """l of a segment that no network was asked about: what rises by six deviations is then a thing."""
 LEAST = 0.2
 """What is less likely a thing is left out: a thing that is missed costs as much as four bodies of nothing."""
-_BODY_WEIGHTS = (0.65, -0.75, 0.95, -1.3)
-"""a', b', c', d', a regression on bodies of benchmarks/household_things.  The score of the body, the affinity to larger
-segments, contact with them, and what hides the segment add nothing to it."""
-LEAST_POSTERIOR = 0.35
+_BODY_WEIGHTS = (0.2, -0.8, 0.7, -0.5, -4.0, -2.2)
+"""a' to f', a regression on bodies of benchmarks/household_things.  The score of the body, and what hides the segment,
+tell things that are hidden themselves, and not fragments alone."""
+LEAST_POSTERIOR = 0.25
 """What is less likely a thing is left out with its body."""
 _BLOCKS = (4, 32)
 """Pixels a side of the smallest and the largest block of the support."""
@@ -98,11 +99,12 @@ def prior(rise: float, of_one_object: float | None = None) -> float:
     return float(probability(a * median + b * math.log(min(max(rise, 0.1), _MOST_SURE)) + c))
 
 
-def posterior(likely: float, uncertainty: float, pixels: float) -> float:
-    """The probability that a segment is a thing once its body is known, of p, u (NaN: 1) and n."""
-    a, b, c, d = _BODY_WEIGHTS
+def posterior(likely: float, uncertainty: float, pixels: float, affinity: float, overlap: float) -> float:
+    """The probability that a segment is a thing once its body is known, of p, u (NaN: 1), n, q and o."""
     p, u = min(likely, 0.999), min(1.0, max(uncertainty, 1e-3))  # NaN is no less than 1
-    return float(probability(a * math.log(p / (1 - p)) + b * math.log(u) + c * math.log(pixels) + d))
+    q = max(affinity, 2.5e-3)  # the least that a network says of two segments
+    told = (math.log(p / (1 - p)), math.log(u), math.log(pixels), math.log(q), overlap, 1.0)
+    return float(probability(sum(weight * each for weight, each in zip(_BODY_WEIGHTS, told, strict=True))))
 
 
 def probability(log_odds: Any) -> Any:

@@ -2,8 +2,7 @@
 
 Steps
 -----
-1. The support plane, bent as the sensor bends it (:mod:`sq_perception.segmentation.support_plane`), and what is clearly
-   above it.
+1. The support plane (:mod:`sq_perception.segmentation.support_plane`), and what is clearly above it.
 2. Components of it that no depth step cuts, taken apart where lines of sight within them cross empty space, joined
    where none between them does (:mod:`sq_perception.segmentation.convex_parts`), and continued down to their foot.
 3. What stands on the level top of one is looked for again, with that top as its support: where it rises by little more
@@ -37,7 +36,7 @@ from sq_perception.segmentation import container_walls, convex_parts, level_face
 from sq_perception.segmentation.evidence import UNKNOWN_SIGMA, FrameEvidence
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.options import EVERYTHING, LARGEST_THING, POINTS, SegmentationOptions, largest_edge
-from sq_perception.segmentation.support_plane import CLEARLY, LEAST_SIGMA, TOLERANCE, SupportSurface
+from sq_perception.segmentation.support_plane import CLEARLY, LEAST_SIGMA, TOLERANCE, Plane
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """What an object has at least, pixels and share of the image; at VGA a square of 2 cm at 0.8 m."""
@@ -93,17 +92,16 @@ def propose(depth: np.ndarray, camera: Camera, depth_range: tuple[float, float] 
     is_silhouette, (rows, columns) = _is_silhouette(valid), np.nonzero(valid)
     if is_silhouette and largest_edge(regions.some_points(rows, columns, known, camera, POINTS)) <= LARGEST_THING:
         return _without_support(known, valid, camera, max(least, round(_LEAST_PIECE * np.count_nonzero(valid))))
-    plane = support_plane.support(depth, valid, camera)
-    if plane is None:
+    support = support_plane.support(depth, valid, camera)
+    if support is None:
         return _without_support(known, valid, camera, least)
-    support = support_plane.fit_surface(plane, known, valid, camera)
     relative = support.image_relative(known, camera)
     labels = _find_raised(known, camera, relative, valid, support)
     tops = level_faces.samples(labels, known, camera, least)
     for label, face in level_faces.find_faces(tops, labels, known, camera, support, least).items():
         valid = level_faces.find_above(label, tops[label], face, labels, known, camera)
         labels = _unload(labels, valid, face, known, camera, least)
-    around = container_walls.walls(tops, plane.equation)
+    around = container_walls.walls(tops, support.equation)
     labels = np.where(np.isin(labels, list(around)), 0, labels) if around else labels
     found = _order(FrameEvidence(labels, support=support), least)
     if is_silhouette and not found.ids:
@@ -184,7 +182,7 @@ def from_labels(
     is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
     around = support_plane.around(labels, ids, depth, valid, camera) if ids and camera.is_pinhole else None
-    return FrameEvidence(labels, ids, None if around is None else support_plane.flat_surface(around), is_cut=is_cut)
+    return FrameEvidence(labels, ids, around, is_cut=is_cut)
 
 
 def least_pixels(size: int) -> int:
@@ -232,7 +230,7 @@ def _without_support(known: np.ndarray, valid: np.ndarray, camera: Camera, least
 
 
 def _unload(
-    labels: np.ndarray, above: np.ndarray, face: SupportSurface, known: np.ndarray, camera: Camera, least: int
+    labels: np.ndarray, above: np.ndarray, face: Plane, known: np.ndarray, camera: Camera, least: int
 ) -> np.ndarray:
     """Give what stands on a level face, among the pixels ``above`` it, labels of its own, found with it as support."""
     relative = face.image_relative(known, camera)
@@ -252,7 +250,7 @@ def _order(found: FrameEvidence, least: int) -> FrameEvidence:
 
 
 def _find_raised(
-    known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: SupportSurface
+    known: np.ndarray, camera: Camera, relative: np.ndarray, valid: np.ndarray, support: Plane
 ) -> np.ndarray:
     """Find bodies of what is above the support: labels (height, width) from 1, in no order, 0 elsewhere.
 

@@ -1,4 +1,4 @@
-"""The plane that things stand on, as the sensor bends it: planes of a depth image, and which of them is the table.
+"""The plane that things stand on: planes of a depth image, and which of them is the table.
 
 Equation
 --------
@@ -9,15 +9,9 @@ n.p + d = 0 with |n| = 1 in the optical frame and n towards the camera, so that 
 Depth noise of triangulating and time-of-flight cameras grows about as g(z) = z^2; tolerances are therefore
 sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.  Planes are found by RANSAC on a seeded subsample and
 least squares on the inliers.  The table is the one with many points that lies low in the image, right below what is on
-no plane.  Its calibration may bend a sensor's depth: a table is where
+no plane.
 
-    | h / g - b(x, y) | < tolerance,    b = b_0 + b_1 x + b_2 y + b_3 x^2 + b_4 x y + b_5 y^2,
-
-x = (u - cx)/fx and y = (v - cy)/fy.  b is fitted to a band about itself again and again, so that it grows from the part
-of a table that lies in one plane over all of it, within what a calibration may be off, a share of the depth.
-
-Metres and pixels.  References: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981); P. J. Besl,
-R. C. Jain, Segmentation through variable-order surface fitting, IEEE PAMI 10 (1988).
+Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981).
 """
 
 from __future__ import annotations
@@ -28,7 +22,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import deviation, quantile
+from sq_perception.geometry.quantiles import deviation
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 
@@ -50,8 +44,6 @@ LEAST_SIGMA = 5e-4
 """Noise of the depth at one metre, metres, that is assumed at least: rendered images have none."""
 CLEARLY = 4.0
 """Standard deviations of the noise from which on a height is none of it."""
-_DISTORTION = 0.02
-"""Makers of depth cameras promise an error of at most 2 % of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +64,24 @@ class Plane:
     share: float
     sigma: float
 
+    @property
+    def clear_height(self) -> float:
+        """Height from which on something is clearly above the plane, metres at one metre of depth.
+
+        Half of the tolerance is a compromise: bent depth of real cameras stays below, thin objects stay above.
+        """
+        return max(0.5 * TOLERANCE, CLEARLY * self.sigma)
+
     def height(self, points: np.ndarray) -> np.ndarray:
         """Height (...) of points (..., 3) above the plane, metres."""
         return points @ self.equation[:3] + self.equation[3]
+
+    def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """Height, float32 (height, width), above the plane as at one metre of depth, 0 for depth 0; of a pinhole
+        camera's depth image."""
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height) - camera.cy) / camera.fy
+        return np.asarray(_relative(depth, x, y, self.equation))
 
 
 def noise_growth(z: np.ndarray) -> np.ndarray:
@@ -229,95 +236,14 @@ def _vote(plane: Plane) -> float:
     return plane.share * (0.25 + max(0.0, up))
 
 
-@dataclass(frozen=True, eq=False)
-class SupportSurface:
-    """A plane, and how the sensor bends it.
-
-    Attributes
-    ----------
-    plane
-        The support plane, with the noise about it.
-    bend : (6,)
-        Coefficients of the height at one metre, by 1, x, y, x^2, x y and y^2.
-    limit
-        The most that the surface bends, metres at one metre.
-    sigma
-        Standard deviation of the heights above the bent surface at a depth of one metre, metres.
-    """
-
-    plane: Plane
-    bend: np.ndarray
-    limit: float
-    sigma: float
-
-    @property
-    def clear_height(self) -> float:
-        """Height from which on something is clearly above the surface, metres at one metre of depth.
-
-        Half of the tolerance is a compromise: bent depth of real cameras stays below, thin objects stay above.
-        """
-        return max(0.5 * TOLERANCE, CLEARLY * self.sigma)
-
-    def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Height, float32 (height, width), above the bent surface as at one metre of depth, 0 for depth 0; of a pinhole
-        camera's depth image."""
-        x = (np.arange(camera.width) - camera.cx) / camera.fx
-        y = (np.arange(camera.height) - camera.cy) / camera.fy
-        return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
-
-
-def flat_surface(plane: Plane) -> SupportSurface:
-    """Make the surface of a plane that is not known to be bent."""
-    return SupportSurface(plane, np.zeros(6), 0.0, plane.sigma)
-
-
-def fit_surface(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
-    """Fit the surface that a plane was seen as.
-
-    Parameters
-    ----------
-    plane
-        Found in this image.
-    depth, valid : (height, width)
-        Metres, and where they are a measurement.
-    camera
-        A pinhole camera.
-    """
-    k = max(1, min(depth.shape) // 60)  # samples along the shorter side
-    rows, columns = np.nonzero(valid[::k, ::k])
-    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
-    z = points[:, 2]
-    x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
-    height = plane.height(points) / growth
-    on = np.abs(height) < TOLERANCE
-    if not on.any():
-        return flat_surface(plane)
-    limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
-    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
-    for _ in range(6):
-        if np.count_nonzero(on) < 10 * len(terms):
-            return flat_surface(plane)
-        bend = np.linalg.lstsq((terms * on) @ terms.T, terms @ (on * height), rcond=None)[0]
-        off, last = np.abs(height - np.clip(bend @ terms, -limit, limit)), on
-        on = off < TOLERANCE
-        if np.array_equal(on, last):
-            break
-    return SupportSurface(plane, bend, limit, deviation(off[on]))
-
-
 @kernel
-def _relative(
-    depth: np.ndarray, x: np.ndarray, y: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float
-) -> np.ndarray:
+def _relative(depth: np.ndarray, x: np.ndarray, y: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """The rest of a row is constant, and no pixel branches: a row becomes vector code."""
     height = np.empty(depth.shape, np.float32)
     for v in range(depth.shape[0]):
-        slope, first = plane[1] * y[v] + plane[2], bend[0] + y[v] * (bend[2] + bend[5] * y[v])
-        second = bend[1] + bend[4] * y[v]
+        slope = plane[1] * y[v] + plane[2]
         for u in range(depth.shape[1]):
             z = np.float64(depth[v, u])
-            above = z * (plane[0] * x[u] + slope) + plane[3]
-            off = first + x[u] * (second + bend[3] * x[u])
-            relative = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
+            relative = (z * (plane[0] * x[u] + slope) + plane[3]) / max(z * z, LEAST_GROWTH)
             height[v, u] = relative if z > 0 else 0.0
     return height

@@ -11,14 +11,20 @@ from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.objectness import posterior
 
 
-def test_a_thing_is_likelier_the_likelier_it_was_the_surer_its_size_and_the_more_of_it_is_seen():
-    by_prior = [posterior(prior, 0.3, 2.0) for prior in (0.2, 0.5, 0.9, 1.0)]
-    by_size = [posterior(0.5, uncertainty, 2.0) for uncertainty in (1.0, 0.3, 0.1, 0.0)]
-    by_pixels = [posterior(0.5, 0.3, pixels) for pixels in (1.0, 2.0, 20.0)]
-    for each in (by_prior, by_size, by_pixels):
-        assert 0 < each[0] < each[-1] < 1
-        assert each == sorted(each)
-    assert posterior(0.5, np.nan, 2.0) == by_size[0], "of which nothing is known"
+@pytest.mark.parametrize(
+    ("what", "values"),
+    [
+        ("likely", (0.2, 0.5, 0.9, 1.0)), ("uncertainty", (np.nan, 1.0, 0.3, 0.1, 0.0)), ("pixels", (1.0, 2.0, 20.0)),
+        ("affinity", (1.0, 0.3, 0.1, 0.0)), ("overlap", (1.0, 0.5, 0.0)),
+    ],
+)
+def test_a_thing_is_likelier_the_surer_it_and_its_size_are_the_more_is_seen_and_the_less_another_one_explains_it(
+    what, values
+):
+    usual = {"likely": 0.5, "uncertainty": 0.3, "pixels": 2.0, "affinity": 0.0, "overlap": 0.0}
+    each = [posterior(**usual | {what: value}) for value in values]
+    assert 0 < each[0] < each[-1] < 1
+    assert each == sorted(each)
 
 
 @pytest.mark.parametrize(("likely", "is_kept"), [(0.9, True), (0.2, False)])

@@ -24,7 +24,7 @@ from sq_perception.learning.networks import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object, supports
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.evidence import FrameEvidence
-from sq_perception.segmentation.support_plane import Plane, flat_surface
+from sq_perception.segmentation.support_plane import Plane
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -340,7 +340,7 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     assert small.sum() > 200
     found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
     assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
-    given = FrameEvidence(small, (1,), flat_surface(Plane(scene.plane, 1.0, 1e-3)))
+    given = FrameEvidence(small, (1,), Plane(scene.plane, 1.0, 1e-3))
     (obj,) = seen_object.objects(depth, given, CAMERA)
     whole = seen_object.complete(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()

@@ -14,7 +14,7 @@ from sq_perception.imaging import raycast
 from sq_perception.recovery import seen_object, supports
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.segments import from_labels
-from sq_perception.segmentation.support_plane import Plane, flat_surface
+from sq_perception.segmentation.support_plane import Plane
 from sq_perception.simulation.scenes import plane_depth
 
 LOW_BOX = (0.12, 0.1, 0.04)
@@ -93,7 +93,7 @@ def test_what_reaches_below_the_table_stands_on_what_is_lower_or_on_nothing_know
     # Of what stands in a hole the whole front is seen, as if the table before it were of glass.
     labels = np.where((depth < ground) | ((index == 0) & ~beside), index + 1, 0).astype(np.int32)
     depth = noisy(np.where(labels > 0, depth, ground), 1e-3)
-    found = replace(from_labels(labels, depth, VGA), support=flat_surface(Plane(table.plane, 1.0, 1e-3)))
+    found = replace(from_labels(labels, depth, VGA), support=Plane(table.plane, 1.0, 1e-3))
     (box,) = seen_object.objects(depth, found, VGA)
     plane = supports.support(box, [box], depth, VGA, found, SegmentationOptions())
     assert (plane is not None) == is_seen
@@ -108,7 +108,7 @@ def test_the_wall_behind_in_a_mask_too_large_is_no_support(wall: float) -> None:
     depth = np.fmin(depth, np.float32(wall))
     labels = cv2.dilate(labels.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.int32)
     assert np.mean(depth[labels > 0] > wall - 0.01) > 0.02
-    found = replace(from_labels(labels, depth, VGA), support=flat_surface(Plane(table.plane, 1.0, 1e-3)))
+    found = replace(from_labels(labels, depth, VGA), support=Plane(table.plane, 1.0, 1e-3))
     (box,) = seen_object.objects(depth, found, VGA)
     plane = supports.support(box, [box], depth, VGA, found, SegmentationOptions())
     np.testing.assert_array_equal(plane, table.plane)

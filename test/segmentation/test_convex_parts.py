@@ -74,33 +74,6 @@ def test_pieces_of_one_body_are_joined_and_those_of_two_are_not():
     assert min(ious(truth, found)) > 0.99
 
 
-def test_a_bowl_has_no_convex_parts():
-    """The inside of a hemisphere: every line through it is crossed, and no part of it is convex."""
-    v, u = np.indices((CAMERA.height, CAMERA.width))
-    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
-    radius = np.hypot(x, y) * 0.7
-    depth = np.where(radius < 0.08, 0.7 + np.sqrt(np.maximum(0.09**2 - radius**2, 0)), 1.0).astype(np.float32)
-    mask = radius < 0.08
-    labels = mask.astype(np.int32)
-    np.testing.assert_array_equal(convex_parts.correct(labels, depth, CAMERA, NOISE), labels)
-
-
-def test_a_cup_between_two_balls_is_parted_from_them_and_keeps_its_inside():
-    """A cup seen from the side, its front wall and above it a strip of the inside, before the balls in the image."""
-    depth, truth = seen([body(-0.1, (0.07, 0.07, 0.07)), body(0.1, (0.07, 0.07, 0.07))], noise=0.0)
-    v, u = np.indices(depth.shape)
-    x, y = (u - CAMERA.cx) / CAMERA.fx * 0.7, (v - CAMERA.cy) / CAMERA.fy * 0.7
-    bulge = np.sqrt(np.maximum(0.045**2 - x**2, 0))
-    cup = np.abs(x) < 0.044
-    wall, inside = cup & (y > -0.03) & (y < 0.06), cup & (y > -0.05) & (y <= -0.03)
-    depth[wall], depth[inside] = (0.68 - bulge)[wall], (0.68 + bulge)[inside]
-    truth[wall | inside] = 3
-    depth += NOISE * depth**2 * np.random.default_rng(0).standard_normal(depth.shape).astype(np.float32)
-    found = convex_parts.correct((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
-    assert len(names(found)) == 3
-    assert min(ious(truth, found)) > 0.7
-
-
 def test_other_names_give_the_same_segments():
     depth, truth = seen([body(-0.1), body(0.0), body(0.1)])
     one = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
@@ -144,20 +117,3 @@ def test_a_board_goes_on_behind_what_is_nearer():
     assert left == right != post
     assert len(set(of_parts(*behind_a_post(tilt=0.5)))) == 3, "they are two faces"
     assert len(set(of_parts(*behind_a_post(between=0.9)))) == 3, "the gap shows what lies behind"
-
-
-def pot():
-    """A front wall with an inside a step behind it, below whose bottom something else is seen."""
-    v, u = np.indices((CAMERA.height, CAMERA.width))
-    x, y = (u - CAMERA.cx) / CAMERA.fx * 0.7, (v - CAMERA.cy) / CAMERA.fy * 0.7
-    bulge = np.sqrt(np.maximum(0.06**2 - x**2, 0))
-    across = np.abs(x) < 0.058
-    wall, inside = across & (y > 0) & (y < 0.06), across & (y > -0.04) & (y <= 0)
-    depth = np.where(wall, 0.7 - bulge, np.where(inside, 0.7 + bulge, 1.5))
-    depth += NOISE * depth**2 * np.random.default_rng(0).standard_normal(depth.shape)
-    return depth.astype(np.float32), (wall + 2 * inside).astype(np.int32)
-
-
-def test_an_inside_is_one_with_the_wall_before_it():
-    depth, labels = pot()
-    assert len(names(convex_parts.correct(labels, depth, CAMERA, NOISE))) == 1

@@ -49,7 +49,7 @@ def supported(depth):
     """The support of an image, and its depth with 0 where there is none."""
     valid = np.isfinite(depth)
     known = np.where(valid, depth, np.float32(0))
-    return support_plane.fit_surface(support_plane.support(depth, valid, VGA), known, valid, VGA), known
+    return support_plane.support(depth, valid, VGA), known
 
 
 def faces(labels, known, support):
@@ -68,9 +68,9 @@ def test_the_face_is_that_of_the_carton(seed):
     support, known = supported(depth)
     ((label, face),) = faces(labels, known, support).items()
     assert label == 1
-    assert face.plane.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
+    assert face.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
     middle = table.origin + TOP * table.plane[:3]
-    assert face.plane.height(middle) == pytest.approx(0, abs=2e-3)
+    assert face.height(middle) == pytest.approx(0, abs=2e-3)
     points = level_faces.samples(labels, known, VGA, 1)[1]
     above = level_faces.find_above(1, points, face, labels, known, VGA)
     assert above[truth == 1].all()
@@ -85,7 +85,7 @@ def test_the_seat_of_a_stool_is_a_face_though_it_is_the_lowest_that_is_seen_of_i
     depth, truth = table.see([seat, table.body(0, 0, (0.03, 0.02, 0.015), height=0.45)], 1e-3)
     support, known = supported(depth)
     (face,) = faces((truth > 0).astype(np.int32), known, support).values()
-    assert face.plane.height(table.origin + 0.45 * table.plane[:3]) == pytest.approx(0, abs=2e-3)
+    assert face.height(table.origin + 0.45 * table.plane[:3]) == pytest.approx(0, abs=2e-3)
 
 
 def test_a_carton_without_a_load_and_a_thing_without_a_level_face_are_left_alone():

@@ -136,7 +136,7 @@ def bowl(depth, truth, label, radius, thickness, rim, camera=VGA):
 def test_a_bowl_stays_one(radius, rim, noise):
     """Its inner wall is a step behind its rim; a box beside it is not drawn in."""
     depth, truth = bowl(*TABLE.see([TABLE.body(0.2, 0, (0.03, 0.03, 0.03))]), 2, radius, 0.004, rim)
-    found = segment(noisy(depth, noise), VGA)
+    found = judged_by_network(noisy(depth, noise), VGA)
     assert len(found.ids) == 2
     assert min(ious(truth, found.labels)) > 0.9
 
