@@ -16,9 +16,10 @@ once a rule, by the geometry and the network of masks as ``Recoverer.recover`` d
 
 A row gives what the rule gains: the figure with it less the figure without it, in per cent of the things, or segments
 in 100 scenes; with the standard error of the sum of the scenes' differences.  A rule that gains less than two standard
-errors has no place in the package.  results/segmentation_rules_before.md has those that were there before.  ``--each``
-names a file of JSON lines, one a scene, that a run adds to: a run that was stopped goes on, and one of more scenes or
-other seeds counts them together.
+errors has no place in the package.  results/segmentation_rules_before.md has those of the first trial,
+results/segmentation_rules_removed.md those that went since, and why some came back.  ``--each`` names a file of JSON
+lines, one a scene, that a run adds to: a run that was stopped goes on, and one of more scenes or other seeds counts
+them together.
 
 ``--unlabelled`` takes recorded frames (NPZ with depth, K and, in words, ``source``) without masks: how many of them a
 rule changes, and the segments with it, and without it, that no other one overlaps by an IoU of 0.8.

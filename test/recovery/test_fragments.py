@@ -27,8 +27,8 @@ def test_a_thing_is_likelier_the_surer_it_and_its_size_are_the_more_is_seen_and_
     assert each == sorted(each)
 
 
-@pytest.mark.parametrize(("likely", "is_kept"), [(0.9, True), (0.2, False)])
-def test_a_fragment_is_no_body_has_no_pixels_and_is_said(likely, is_kept):
+@pytest.mark.parametrize(("likely", "affinity", "is_kept"), [(0.9, 0.0, True), (0.2, 0.0, False), (0.9, 0.9, False)])
+def test_a_fragment_is_no_body_has_no_pixels_and_is_said(likely, affinity, is_kept):
     """The face of a box, less a strip of it, and that strip, whose body has no depth."""
     table = Table(pitch=0.9)
     depth, truth = table.see([table.body(0.0, 0.0, (0.06, 0.05, 0.05))], 1e-3)
@@ -36,7 +36,10 @@ def test_a_fragment_is_no_body_has_no_pixels_and_is_said(likely, is_kept):
     labels = truth.astype(np.int32)
     strip = np.arange(depth.shape[1]) < columns[0] + 4
     labels[(truth == 1) & strip] = 2
-    evidence = FrameEvidence(labels, (1, 2), objectness=(0.99, likely), membership=np.ones(labels.shape, np.float32))
+    evidence = FrameEvidence(
+        labels, (1, 2), objectness=(0.99, likely), membership=np.ones(labels.shape, np.float32),
+        affinity=affinity * (1 - np.eye(2)),
+    )
     chain = Recoverer(method="symmetry", threads=1)
     readings = chain.read(depth, VGA)
     recovery = chain.recover_objects(readings, chain.find_objects(readings, evidence))
