@@ -13,8 +13,7 @@ LARGEST_TAPER = 0.95
 LEAST_CONJUGATE = 1e-3
 """Least 2 - e, the exponent of the dual norm: 0 would be the maximum of an octahedron, from which this differs by at
 most 0.04 % for each norm, and without a division by 0."""
-_LEAST_SQUARE = 1e-18
-"""Least squared length of a quaternion."""
+_LEAST_SQUARE = 1e-18  # least squared length of a quaternion
 
 
 def floating(part: Any) -> np.ndarray:

@@ -29,8 +29,7 @@ _log = logging.getLogger(__name__)
 _BESIDE = ("-m", "sq_perception", "warm-up", "--only", "segmentation", "network")
 """Arguments of Python that compile what a first recovery needs after the fit."""
 _is_shared = False
-_beside: list[subprocess.Popen[bytes]] = []
-"""The process that compiles beside this one, once it was started."""
+_beside: list[subprocess.Popen[bytes]] = []  # the process that compiles beside this one, once it was started
 
 
 def compile_beside() -> None:

@@ -16,14 +16,12 @@ from typing import Any
 from threadpoolctl import ThreadpoolController
 
 _lock = threading.Lock()
-_blocks: list[Any] = []
-"""What undoes the setting, once for each block that asks for one thread: the same for all."""
+_blocks: list[Any] = []  # what undoes the setting, once for each block that asks for one thread: the same for all
 TURN = 0.001
 """Seconds after which a thread of Python lets another one go on.  A thread that returns from compiled code waits for
 the interpreter: with Python's 5 ms, two threads recovered five bodies of a VGA frame in 53 ms, where one took 51; with
 1 ms in 45, and with less as well."""
-_turns: list[float] = []
-"""Python's own setting, once for each block that asks for short turns."""
+_turns: list[float] = []  # Python's own setting, once for each block that asks for short turns
 
 
 @cache

@@ -22,8 +22,7 @@ from sq_perception.geometry.kernels import inline_kernel, kernel, support
 
 FAR, NEAR = 0.05, 0.02
 """Largest gap to a body and distance to a point, metres; larger ones are cut off, as nothing depends on them."""
-_STRAY = 3
-"""Number of nearest points that are ignored as flying pixels."""
+_STRAY = 3  # number of nearest points that are ignored as flying pixels
 
 
 @kernel

@@ -10,8 +10,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import hole_filling
 from sq_perception.imaging.camera import Camera, Lens
 
-_MOST = 6000
-"""Maximum number of kept points."""
+_MOST = 6000  # maximum number of kept points
 
 
 @dataclass(frozen=True, eq=False)

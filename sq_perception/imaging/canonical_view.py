@@ -48,8 +48,7 @@ NEAREST = 0.5 * (1 + 1 / MARGIN)
 """z0: the value of the object's nearest point."""
 OUTLIERS_PER_END = 1 / 500
 """Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
-_NEARER = 0.04
-"""Share of the view's side by which something nearer than the object hides what is behind it."""
+_NEARER = 0.04  # share of the view's side by which something nearer than the object hides what is behind it
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 

@@ -34,8 +34,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 _IMAGE_HEADER = struct.Struct(">8xI4sIIBB")
 """The beginning of a PNG: length and name of its first chunk, width, height, bits, colour type (0 is grey)."""
 _RVL_HEADER = struct.Struct("<II")
-_MOST_RVL_PIXELS = 2**23
-"""Above any depth camera's; unpacking takes some 100 bytes of memory for each."""
+_MOST_RVL_PIXELS = 2**23  # above any depth camera's; unpacking takes some 100 bytes of memory for each
 
 
 def encoding(image_format: str) -> str | None:

@@ -34,10 +34,8 @@ DepthKind = Literal["z", "range"]
 """What a depth image holds: z along the optical axis, or the distance to the camera's centre along each ray."""
 MILLIMETRES = 1000.0
 """Units a metre."""
-_STRAYS = 0.01
-"""Share of the readings that may lie in between, as where an image was scaled down."""
-_NO_DISPARITY = 2047
-"""Raw number of a Kinect that measured nothing."""
+_STRAYS = 0.01  # share of the readings that may lie in between, as where an image was scaled down
+_NO_DISPARITY = 2047  # raw number of a Kinect that measured nothing
 
 
 class UnitsError(ValueError):

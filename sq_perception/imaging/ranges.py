@@ -22,10 +22,8 @@ RANGES = (
     "the support bends as if the image held distances to the camera's centre in place of z: --depth-kind range of "
     "commands, depth_kind of nodes"
 )
-_TOLERANCE = 0.006
-"""Of a plane, as a share of the distance."""
-_LEVER = 0.01
-"""Root mean square of log |r| on the plane, beside what a tilt explains."""
+_TOLERANCE = 0.006  # of a plane, as a share of the distance
+_LEVER = 0.01  # root mean square of log |r| on the plane, beside what a tilt explains
 
 
 def seem_ranges(depth: np.ndarray, camera: Camera) -> bool:

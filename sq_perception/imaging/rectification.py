@@ -39,8 +39,7 @@ from sq_perception.imaging.inverse_depth import STEEPEST
 
 LARGEST_SIDE = 2**15 - 2
 """Largest side of an image that OpenCV can look up, pixels."""
-_OUTSIDE = -9.0
-"""A column and row that no image has."""
+_OUTSIDE = -9.0  # a column and row that no image has
 
 
 @dataclass(frozen=True)

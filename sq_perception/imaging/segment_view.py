@@ -35,8 +35,7 @@ from sq_perception.imaging.depth_steps import STEP
 PIXELS = 64
 CHANNELS = 9
 MEASURED, NEARNESS, HEIGHT, SEGMENT, OTHERS, IMAGE, SCALE, GRAIN, PLANE = range(CHANNELS)
-_POINTS = 3
-"""Points of a cell along each axis."""
+_POINTS = 3  # points of a cell along each axis
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,7 @@ THESIS_SHARPNESS = 117.3
 """Sharpness s of the thesis' renderer."""
 THESIS_TAU = 4.82
 _NEGLIGIBLE = 30.0
-_PER_E = math.log2(math.e)
-"""The logarithm of e to base 2."""
+_PER_E = math.log2(math.e)  # the logarithm of e to base 2
 _AT_ONCE = 16
 """Voxels walked at once, for vector code: some 8 lie where a surface is soft, and 7 of a solid let nothing pass."""
 

@@ -30,8 +30,7 @@ from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
 from sq_perception.simulation.view_rendering import Occluder, render_views
 
 GREY_LEVELS = 255.0
-_SMALLEST = 1 / GREY_LEVELS
-"""Least depth of a view that is not background."""
+_SMALLEST = 1 / GREY_LEVELS  # least depth of a view that is not background
 POOL = 4096
 """Views of a pool: a gigabyte of those of the thesis' size."""
 

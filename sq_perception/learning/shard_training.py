@@ -56,10 +56,8 @@ from sq_perception.simulation.segment_views import UNKNOWN, YES, SegmentViews, d
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 AROUND = 0.5
-_KEPT_BACK = 0.1
-"""Share of the views without their extent, without the plane, and without other segments."""
-_AT_ONCE = 128
-"""Views of a validation that are computed at once."""
+_KEPT_BACK = 0.1  # share of the views without their extent, without the plane, and without other segments
+_AT_ONCE = 128  # views of a validation that are computed at once
 _IN_MEMORY = 2**30
 """Bytes of shards that are read at once, three times that while others are: as many views as a training of masks shows
 between two validations."""

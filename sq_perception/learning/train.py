@@ -32,8 +32,7 @@ _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optim
 """Settings whose change makes another run; others may change when it goes on."""
 _VALIDATED = ("pinhole_share", "noisy_share", "occluded_share", "validation")
 """Settings that decide what a network is validated on."""
-_FORM = ("backbone", "framing", "pixels")
-"""Settings that a network to begin with brings along."""
+_FORM = ("backbone", "framing", "pixels")  # settings that a network to begin with brings along
 
 
 def train(

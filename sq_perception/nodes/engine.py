@@ -31,8 +31,7 @@ from sq_perception.recovery.still_scene import Reference, StillScene
 from sq_perception.segmentation.options import Pose
 from sq_perception.simulation.scenes import TABLE_CAMERA
 
-_MADE_OF = ("device", "threads", "method", "model")
-"""Parameters that determine a recoverer."""
+_MADE_OF = ("device", "threads", "method", "model")  # parameters that determine a recoverer
 
 Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 """The bodies of a frame, and a value that is equal for equal origins."""

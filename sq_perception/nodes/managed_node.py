@@ -52,10 +52,8 @@ STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """Clock of timers: simulated time may stand still, which nodes must still report."""
 _EXPECTED = (ValueError, OSError, RuntimeError)
 """Errors of a wrong file, parameter or device; any other is a program error and logged with its traceback."""
-_PAUSE = 2.0
-"""Seconds before a node that failed while active restarts."""
-_END = 4.0
-"""Seconds that :meth:`ManagedNode.close` waits for a transition."""
+_PAUSE = 2.0  # seconds before a node that failed while active restarts
+_END = 4.0  # seconds that ManagedNode.close waits for a transition
 
 
 def optional(node: Node, create: Callable[..., Any], name: str, *arguments: Any, **more: Any) -> Any:

@@ -27,8 +27,7 @@ LARGEST = MOST_BYTES
 """Bytes of one message, or of one unpacked chunk of messages."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-_ZSTD = b"\x28\xb5\x2f\xfd"
-"""What a message that was packed by itself begins with; a plain one begins with the byte 0."""
+_ZSTD = b"\x28\xb5\x2f\xfd"  # what a message that was packed by itself begins with; a plain one begins with the byte 0
 _COLOUR = re.compile(r"colou?r|rgb(?!d)")
 
 

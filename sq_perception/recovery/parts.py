@@ -40,16 +40,11 @@ from sq_perception.segmentation.convex_parts import cluster
 from sq_perception.segmentation.line_of_sight import SampledImage
 
 MOST_PARTS = 4
-_SAMPLES = 120
-"""Samples of an object between which lines are drawn."""
-_LEAST_SHARE = 0.03
-"""Share of the object's samples that a piece has at least."""
-_WITNESSES = 120.0
-"""N above."""
-_FARTHEST = 3.0
-"""Deviations of the noise beyond which a pixel is not explained."""
-_PRICE = 11 / 2 * math.log(_WITNESSES) * 2 / _WITNESSES
-"""What a further body must lessen L by."""
+_SAMPLES = 120  # samples of an object between which lines are drawn
+_LEAST_SHARE = 0.03  # share of the object's samples that a piece has at least
+_WITNESSES = 120.0  # N above
+_FARTHEST = 3.0  # deviations of the noise beyond which a pixel is not explained
+_PRICE = 11 / 2 * math.log(_WITNESSES) * 2 / _WITNESSES  # what a further body must lessen L by
 _FINE = 1.3
 """L of good bodies, mostly: where one leaves no more than the price above it, two are not sought, nor handles where
 parts do."""

@@ -28,10 +28,8 @@ from sq_perception.learning.inference import HullPredictions, Predictor, ThingPr
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.segmentation.evidence import FrameEvidence
 
-_POINTS = 2000
-"""Enough for quantiles of heights to settle."""
-_MOST_ROWS = 4
-"""Pixels by which a given mask is completed at most."""
+_POINTS = 2000  # enough for quantiles of heights to settle
+_MOST_ROWS = 4  # pixels by which a given mask is completed at most
 
 Answers: TypeAlias = Superquadric | HullPredictions
 

@@ -52,17 +52,13 @@ from sq_perception.recovery.recoverer import Found, Recoverer
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.segmentation.evidence import FrameEvidence
 
-_BAND = 2
-"""Compared pixels around an object that belong to it: free space and outline."""
-_CLIP, _FAR = 3.0, 6.0
-"""Noise levels: more is an edge that wandered, in an object's sums and in a patch."""
+_BAND = 2  # compared pixels around an object that belong to it: free space and outline
+_CLIP, _FAR = 3.0, 6.0  # noise levels: more is an edge that wandered, in an object's sums and in a patch
 _BESIDE = 3
 """Compared pixels up to which a new reading may go on with an old one; without, one frame in
 twenty of a still scene has a patch that looks new."""
-_BLOCK = 8
-"""Compared pixels across which noise may be shared."""
-_QUARTILE = 1.15
-"""Three quarters of normal noise lie below this many standard deviations."""
+_BLOCK = 8  # compared pixels across which noise may be shared
+_QUARTILE = 1.15  # three quarters of normal noise lie below this many standard deviations
 _ANEW = 30
 """Repetitions after which the turn of a body comes, of a weak one after a third of them, and age of segments that are
 then found anew: a second at 30 Hz."""

@@ -71,8 +71,7 @@ class _Place:
         ]
 
 
-_Parts = tuple[list[Superquadric], float]
-"""Parts of a piece of furniture, and how far below the objects the floor is."""
+_Parts = tuple[list[Superquadric], float]  # parts of a piece of furniture, and how far below the objects the floor is
 
 
 def _carton(place: _Place, rng: np.random.Generator) -> _Parts:

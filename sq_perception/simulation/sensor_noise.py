@@ -52,8 +52,7 @@ import numpy as np
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.inverse_depth import InverseDepth, beside
 
-_FARTHEST_MOVE = 4
-"""Pixels, more than which no edge wanders."""
+_FARTHEST_MOVE = 4  # pixels, more than which no edge wanders
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, St
 from sq_perception.simulation.thing import Thing
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 
-_PIXELS = 64
-"""Side of the views: what the network of objects takes."""
+_PIXELS = 64  # side of the views: what the network of objects takes
 PROCESSED = 0.5
 """Share of the views whose depth passes through random stages after the sensor; few drawn cameras have none at all."""
 _LEAST_SEEN = 40

@@ -43,8 +43,7 @@ _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 _UP = 128
 _WAYS = np.concatenate([level_directions(_UP), SIX_WAYS[[2, 5]]])
 """Directions: level ones, and from the index ``_UP`` on up and down."""
-_BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
-"""The index of the direction opposite to each."""
+_BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)  # the index of the direction opposite to each
 
 
 @dataclass(frozen=True, eq=False)

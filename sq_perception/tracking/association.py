@@ -246,8 +246,7 @@ TURNS = _rotations()
 EXACT = 8
 """The number of rotations that describe the same body."""
 _QUATERNIONS = quaternions.from_matrix(TURNS)
-_CHANGES = np.zeros((len(TURNS), LENGTH, LENGTH))
-"""What the renaming of axes makes of an error."""
+_CHANGES = np.zeros((len(TURNS), LENGTH, LENGTH))  # what the renaming of axes makes of an error
 _CHANGES[:, range(3, 8), range(3, 8)] = 1
 _CHANGES[:, SIZE, SIZE] = np.abs(TURNS).transpose(0, 2, 1)
 _CHANGES[:, TURN, TURN] = TURNS.transpose(0, 2, 1)
