@@ -98,10 +98,6 @@ def _without(owner: Any, **changed: Any) -> Part:
     return partial(patch.multiple, owner, **changed)
 
 
-def _not_pulled_in(problem: Any, state: Any, free: np.ndarray, _: Any) -> tuple[Any, float]:
-    return state, course._outline_sigma(problem, state, free)
-
-
 PARTS: dict[str, Part] = {
     "other valleys": _without(valleys, explore=_same),
     "all depths of a face": _without(valleys, weigh_depths=_same),
@@ -109,12 +105,10 @@ PARTS: dict[str, Part] = {
     "open sizes": _without(valleys, weigh_open_sizes=_same),
     "oval": _without(valleys, add_oval=_same),
     "straight where no taper is known": _without(course, _drop_unknown_taper=_same),
-    "body pulled into its outline": _without(course, _pull_in=_not_pulled_in),
     "sharper outline": _without(course, sharpen_outline=lambda problem, state, *_: (problem, state)),
     "lost edge": _without(course, drop_lost_edge=lambda problem, state: (problem, state)),
     "more rays under noise": _without(course, _MOST_FINAL_RAYS=course.FINAL_RAYS),
     "first group that promises": _without(course, _PROMISING=np.inf),
-    "least doubt": _without(multistart, DOUBT=0.0),
     "starts turned by 45 degrees": _without(starts, eighth_turns=lambda _: np.empty((0, 3, 3))),
     "other exponents of starts": _without(starts, _EXPONENTS=()),
     "a superquadric of a thing": _without(surface_fit, _is_explained=lambda *_: False, _FINE_NOISE=0.0),

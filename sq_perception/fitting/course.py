@@ -232,29 +232,16 @@ def drop_lost_edge(problem: Problem, state: State) -> tuple[Problem, State]:
 def sharpen_outline(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
     """Estimate the outline's precision from a body's misfit to free rays, and again from the better body it allows.
 
-    The precision does not fall: else pixels that miss a body would cost next to nothing, and it might leave them.
+    It does not fall below a pixel: else pixels that miss a body would cost next to nothing, and it might leave them.
     """
-    state, sigma = _pull_in(problem, state, free, rays)
-    before = math.inf
+    sigma, before = _outline_sigma(problem, state, free), math.inf
     while True:
-        sigma = min(sigma, problem.observation.outline)
+        sigma = min(sigma, problem.observation.footprint)
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
         state = problem.descend(state, rays)
         before, sigma = sigma, _outline_sigma(problem, state, free)
-
-
-def _pull_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
-    """The body, refitted with its outline known to a pixel if it sticks out farther than assumed and that helps; and
-    how far the one returned sticks out, metres."""
-    sigma = _outline_sigma(problem, state, free)
-    if not sigma > problem.observation.outline or problem.late:
-        return state, sigma
-    pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
-    other = pixel.descend(state, rays)
-    nearer = _outline_sigma(problem, other, free)
-    return (other, nearer) if nearer < _SHARPER * sigma else (state, sigma)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
