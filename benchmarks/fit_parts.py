@@ -108,7 +108,6 @@ PARTS: dict[str, Part] = {
     "sharper outline": _without(course, sharpen_outline=lambda problem, state, *_: (problem, state)),
     "lost edge": _without(course, drop_lost_edge=lambda problem, state: (problem, state)),
     "more rays under noise": _without(course, _MOST_FINAL_RAYS=course.FINAL_RAYS),
-    "first group that promises": _without(course, _PROMISING=np.inf),
     "starts turned by 45 degrees": _without(starts, eighth_turns=lambda _: np.empty((0, 3, 3))),
     "other exponents of starts": _without(starts, _EXPONENTS=()),
     "a superquadric of a thing": _without(surface_fit, _is_explained=lambda *_: False, _FINE_NOISE=0.0),

@@ -53,9 +53,6 @@ benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the ot
 EXPLAINS = 1.4
 """Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
 not finished.  Chosen on benchmarks/single_body."""
-_PROMISING = 2.0
-"""Mean squared residual after the few steps from a group of starts, above which the next group is tried first:
-images that a body explains leave 0.8 at most, most others more than this."""
 FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
 """Object rays of the last stage, and most of them under much noise: a depth error of a third of a pixel's width
 averages out to a two hundredth.  Chosen on benchmarks/single_body."""
@@ -132,29 +129,15 @@ def _add_hull(hull: HullPrior, terms: Terms) -> Terms:
 def fit_superquadric(
     problem: Problem, groups: Iterable[Callable[[], Sequence[State]]], patient: bool = True
 ) -> Solution | None:
-    """The best superquadric from groups of starts, as many as it takes to explain the image.
-
-    None if no group was ``patient`` enough: by default the best of all is followed in the end.
-    """
-    tried: list[State] = []
+    """The best superquadric from groups of starts, as many as it takes to explain the image; the nearest one where none
+    does, or None if not ``patient``."""
+    enough = EXPLAINS * problem.floor(BASIN[-1].rays)
     finalists: list[State] = []
-    for group in groups:
-        found = problem.advance(group(), COARSE)
-        tried += found
-        if found and by_cost(found)[0].cost < _PROMISING * problem.floor(COARSE.rays):
-            followed = problem.search(within_doubt(found)[: COARSE.kept], BASIN)
-            finalists = within_doubt([*finalists, *followed])[: COARSE.kept]
-        if (tried and problem.late) or (finalists and finalists[0].cost < EXPLAINS * problem.floor(BASIN[-1].rays)):
-            break
-    if not finalists:
-        if not patient:
-            return None
-        finalists = problem.search(within_doubt(tried)[: COARSE.kept], BASIN)
-    if finalists[0].cost > EXPLAINS * problem.floor(BASIN[-1].rays) and not problem.late:
-        if not patient:
-            return None
-        return Solution(problem, finalists[0], problem.draw(SAMPLE, 0.3))
-    return _finish(problem, finalists)
+    for starts in filter(None, (group() for group in groups)):
+        finalists = within_doubt([*finalists, *problem.search(starts, (COARSE, *BASIN))])[: COARSE.kept]
+        if problem.late or finalists[0].cost < enough:
+            return _finish(problem, finalists)
+    return Solution(problem, finalists[0], problem.draw(SAMPLE, 0.3)) if patient else None
 
 
 def _finish(problem: Problem, finalists: Sequence[State]) -> Solution:

@@ -234,7 +234,7 @@ def turned(state: State) -> State:
     parameters = state.parameters.copy()
     parameters[:2] = math.sqrt(0.5 * (parameters[0] ** 2 + parameters[1] ** 2))
     parameters[4] = START_EXPONENT
-    return State(parameters, np.ascontiguousarray(eighth_turns(state.rotation)[2]), math.inf, state.iterations)
+    return State(parameters, np.ascontiguousarray(state.rotation @ EIGHTH_TURNS[2]), math.inf, state.iterations)
 
 
 def other_orders(state: State) -> list[State]:
