@@ -168,7 +168,7 @@ def fit_thing(problem: Problem, starts: Sequence[State]) -> Solution:
     rays = problem.draw(problem.options.pixels or SAMPLE, 0.3)
     spread = 1.0 if problem.has_hull else SPREAD
     solution = Solution(problem, problem.descend(found[0], rays, 30), rays, spread_factor=spread)
-    solution = _drop_unknown_taper(solution) if problem.has_hull else solution
+    solution = _straighten(solution) if problem.has_hull and not problem.late else solution
     left = _mean_loss(problem, solution.state)
     solution = replace(solution, rays=rays.scale(1 / max(1.0, left / EXPLAINED)))
     # As far off as noise reaches at most: points of a bowl or a pair of pliers typically are.
@@ -177,19 +177,12 @@ def fit_thing(problem: Problem, starts: Sequence[State]) -> Solution:
     return solution
 
 
-def _drop_unknown_taper(solution: Solution) -> Solution:
-    """The solution, its body fitted once more without a taper where the evidence is not for one.
-
-    The ratio of the evidence for k = 0 to that for any k is that of the densities of the posterior and the prior there
-    (J. M. Dickey, The weighted likelihood ratio, Annals of Mathematical Statistics 42(1), 1971): no price of parameters
-    is to be chosen.
-    """
-    problem, taper, covariance = solution.problem, solution.state.parameters[8:], solution.taper_covariance
-    known = taper @ np.linalg.solve(covariance, taper) + np.linalg.slogdet(covariance)[1]
-    if known > 4 * math.log(TAPER_SIGMA) or problem.late:
-        return solution
-    straight = problem.straight()
-    return replace(solution, problem=straight, state=straight.descend(solution.state, solution.rays, 30))
+def _straighten(solution: Solution) -> Solution:
+    """The solution without a taper that hardly lowers its cost."""
+    straight = solution.problem.straight()
+    state = straight.descend(solution.state, solution.rays, 30)
+    is_as_good = state.cost < solution.state.cost + SLACK
+    return replace(solution, problem=straight, state=state) if is_as_good else solution
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
