@@ -74,8 +74,6 @@ _NO_EVIDENCE = 12.5
 """Excess of a cost that is no evidence against a length: through noise its standard deviation is 7."""
 _OVAL = 0.25
 """Share of things that are not round among those of which the image does not tell."""
-_THIN = 0.3
-"""Half size, as a share of the other two, at which one that the image leaves open is also tried."""
 _EXPECTATION_SIGMA = 0.25
 """Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
 
@@ -126,7 +124,7 @@ def weigh_depths(solution: Solution) -> Solution:
 def weigh_open_sizes(solution: Solution) -> Solution:
     """The solution, or a better one once half sizes that the image leaves open are left to priors and a prediction.
 
-    Of a thing each competes with bodies of which that size is like the other two, or thin.
+    Of a thing each competes with bodies of which that size is like the other two.
     """
     problem, state, rays, expected = solution.problem, solution.state, solution.rays, solution.problem.options.expected
     if problem.has_hull or (expected is None and problem.independent is None):
@@ -138,7 +136,7 @@ def weigh_open_sizes(solution: Solution) -> Solution:
     if problem.independent is not None:
         for k in weak:
             typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
-            rivals += [resized(state, k, share * typical) for share in (1.0, _THIN)]
+            rivals.append(resized(state, k, typical))
     if expected is not None:
         prior = expected() if callable(expected) else expected
         extents = prior.support(state.rotation.T)
