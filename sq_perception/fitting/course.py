@@ -53,9 +53,6 @@ benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the ot
 EXPLAINS = 1.4
 """Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
 not finished.  Chosen on benchmarks/single_body."""
-_PROMISING = 2.0
-"""Mean squared residual after the few steps from a group of starts, above which the next group is tried first:
-images that a body explains leave 0.8 at most, most others more than this."""
 FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
 """Object rays of the last stage, and most of them under much noise: a depth error of a third of a pixel's width
 averages out to a two hundredth.  Chosen on benchmarks/single_body."""
@@ -132,29 +129,15 @@ def _add_hull(hull: HullPrior, terms: Terms) -> Terms:
 def fit_superquadric(
     problem: Problem, groups: Iterable[Callable[[], Sequence[State]]], patient: bool = True
 ) -> Solution | None:
-    """The best superquadric from groups of starts, as many as it takes to explain the image.
-
-    None if no group was ``patient`` enough: by default the best of all is followed in the end.
-    """
-    tried: list[State] = []
+    """The best superquadric from groups of starts, as many as it takes to explain the image; the nearest one where none
+    does, or None if not ``patient``."""
+    enough = EXPLAINS * problem.floor(BASIN[-1].rays)
     finalists: list[State] = []
-    for group in groups:
-        found = problem.advance(group(), COARSE)
-        tried += found
-        if found and by_cost(found)[0].cost < _PROMISING * problem.floor(COARSE.rays):
-            followed = problem.search(within_doubt(found)[: COARSE.kept], BASIN)
-            finalists = within_doubt([*finalists, *followed])[: COARSE.kept]
-        if (tried and problem.late) or (finalists and finalists[0].cost < EXPLAINS * problem.floor(BASIN[-1].rays)):
-            break
-    if not finalists:
-        if not patient:
-            return None
-        finalists = problem.search(within_doubt(tried)[: COARSE.kept], BASIN)
-    if finalists[0].cost > EXPLAINS * problem.floor(BASIN[-1].rays) and not problem.late:
-        if not patient:
-            return None
-        return Solution(problem, finalists[0], problem.draw(SAMPLE, 0.3))
-    return _finish(problem, finalists)
+    for starts in filter(None, (group() for group in groups)):
+        finalists = within_doubt([*finalists, *problem.search(starts, (COARSE, *BASIN))])[: COARSE.kept]
+        if problem.late or finalists[0].cost < enough:
+            return _finish(problem, finalists)
+    return Solution(problem, finalists[0], problem.draw(SAMPLE, 0.3)) if patient else None
 
 
 def _finish(problem: Problem, finalists: Sequence[State]) -> Solution:
@@ -185,7 +168,7 @@ def fit_thing(problem: Problem, starts: Sequence[State]) -> Solution:
     rays = problem.draw(problem.options.pixels or SAMPLE, 0.3)
     spread = 1.0 if problem.has_hull else SPREAD
     solution = Solution(problem, problem.descend(found[0], rays, 30), rays, spread_factor=spread)
-    solution = _drop_unknown_taper(solution) if problem.has_hull else solution
+    solution = _straighten(solution) if problem.has_hull and not problem.late else solution
     left = _mean_loss(problem, solution.state)
     solution = replace(solution, rays=rays.scale(1 / max(1.0, left / EXPLAINED)))
     # As far off as noise reaches at most: points of a bowl or a pair of pliers typically are.
@@ -194,19 +177,12 @@ def fit_thing(problem: Problem, starts: Sequence[State]) -> Solution:
     return solution
 
 
-def _drop_unknown_taper(solution: Solution) -> Solution:
-    """The solution, its body fitted once more without a taper where the evidence is not for one.
-
-    The ratio of the evidence for k = 0 to that for any k is that of the densities of the posterior and the prior there
-    (J. M. Dickey, The weighted likelihood ratio, Annals of Mathematical Statistics 42(1), 1971): no price of parameters
-    is to be chosen.
-    """
-    problem, taper, covariance = solution.problem, solution.state.parameters[8:], solution.taper_covariance
-    known = taper @ np.linalg.solve(covariance, taper) + np.linalg.slogdet(covariance)[1]
-    if known > 4 * math.log(TAPER_SIGMA) or problem.late:
-        return solution
-    straight = problem.straight()
-    return replace(solution, problem=straight, state=straight.descend(solution.state, solution.rays, 30))
+def _straighten(solution: Solution) -> Solution:
+    """The solution without a taper that hardly lowers its cost."""
+    straight = solution.problem.straight()
+    state = straight.descend(solution.state, solution.rays, 30)
+    is_as_good = state.cost < solution.state.cost + SLACK
+    return replace(solution, problem=straight, state=state) if is_as_good else solution
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
@@ -232,29 +208,16 @@ def drop_lost_edge(problem: Problem, state: State) -> tuple[Problem, State]:
 def sharpen_outline(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
     """Estimate the outline's precision from a body's misfit to free rays, and again from the better body it allows.
 
-    The precision does not fall: else pixels that miss a body would cost next to nothing, and it might leave them.
+    It does not fall below a pixel: else pixels that miss a body would cost next to nothing, and it might leave them.
     """
-    state, sigma = _pull_in(problem, state, free, rays)
-    before = math.inf
+    sigma, before = _outline_sigma(problem, state, free), math.inf
     while True:
-        sigma = min(sigma, problem.observation.outline)
+        sigma = min(sigma, problem.observation.footprint)
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
         state = problem.descend(state, rays)
         before, sigma = sigma, _outline_sigma(problem, state, free)
-
-
-def _pull_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
-    """The body, refitted with its outline known to a pixel if it sticks out farther than assumed and that helps; and
-    how far the one returned sticks out, metres."""
-    sigma = _outline_sigma(problem, state, free)
-    if not sigma > problem.observation.outline or problem.late:
-        return state, sigma
-    pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
-    other = pixel.descend(state, rays)
-    nearer = _outline_sigma(problem, other, free)
-    return (other, nearer) if nearer < _SHARPER * sigma else (state, sigma)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:

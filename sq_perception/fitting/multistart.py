@@ -53,12 +53,10 @@ FREE_SHARE = 0.25
 """Free rays per object ray: an outline has fewer pixels than an area."""
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 3e-5
 """Gain, as a share of the cost, that a step must promise: a stage ends before one that promises less."""
-DOUBT, RIVAL = 25.0, 1.3
-"""Excess of a cost over the best, and factor of it, up to either of which bodies go on together: on the same rays,
-noise gives a difference D a standard deviation of 2 sqrt(D), of which the first is 2.5; few steps have not converged.
-"""
+DOUBT = 0.3
+"""Excess of a cost over the best, as a share of it, up to which bodies go on together: few steps have not converged."""
 SLACK = 1.0
-"""Difference of costs that few rays may hide: one such standard deviation."""
+"""Difference of costs that few rays may hide: noise gives one of D a standard deviation of 2 sqrt(D)."""
 SIGNIFICANT = 0.5
 """A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
 _ALIKE, _ALONG = 0.01, 0.95
@@ -237,7 +235,7 @@ def within_doubt(candidates: Iterable[State]) -> list[State]:
     """Candidates, best first, without those that are worse than the best by more than noise can make them."""
     ranked = distinct(by_cost(candidates))
     least = ranked[0].cost
-    return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
+    return [state for state in ranked if state.cost <= least + DOUBT * abs(least)]
 
 
 def distinct(states: Iterable[State]) -> list[State]:

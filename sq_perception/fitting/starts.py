@@ -229,19 +229,12 @@ def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: 
 # Rivals of a body at hand
 
 
-def other_depths(state: State, axis: int) -> list[State]:
-    """The body with half of its half size along an axis, with more of it, and turned."""
-    size = state.parameters[axis]
-    return [resized(state, axis, 0.5 * size), resized(state, axis, 1.4 * size), _turned(state)]
-
-
-def _turned(state: State) -> State:
+def turned(state: State) -> State:
     """The body turned by 45 degrees about its z: a square cross-section and a round one are hard to distinguish."""
     parameters = state.parameters.copy()
     parameters[:2] = math.sqrt(0.5 * (parameters[0] ** 2 + parameters[1] ** 2))
     parameters[4] = START_EXPONENT
-    turned = eighth_turns(state.rotation)[2]
-    return State(parameters, np.ascontiguousarray(turned), math.inf, state.iterations)
+    return State(parameters, np.ascontiguousarray(state.rotation @ EIGHTH_TURNS[2]), math.inf, state.iterations)
 
 
 def other_orders(state: State) -> list[State]:
@@ -252,15 +245,6 @@ def other_orders(state: State) -> list[State]:
         parameters[:3] = order.T @ parameters[:3]
         parameters[3:5] = START_EXPONENT
         found.append(State(parameters, np.ascontiguousarray(state.rotation @ order), math.inf, state.iterations))
-    return found
-
-
-def other_axes(state: State) -> list[State]:
-    """Bodies of the same moments with each axis as z, and turned by 45 degrees about each axis."""
-    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * MOMENT_SHARE) @ state.rotation.T
-    found: list[State] = []
-    for axes in [state.rotation, *eighth_turns(state.rotation)]:
-        found += states(state.parameters[5:8], moments, axes)
     return found
 
 

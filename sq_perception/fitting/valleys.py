@@ -31,7 +31,16 @@ import numpy as np
 from sq_perception.fitting import starts
 from sq_perception.fitting.cost import Ray, Rays
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.multistart import SETTLE, SIGNIFICANT, SLACK, Problem, Solution, alike, by_cost
+from sq_perception.fitting.multistart import (
+    SETTLE,
+    SIGNIFICANT,
+    SLACK,
+    Problem,
+    Solution,
+    alike,
+    by_cost,
+    distinct,
+)
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.quality import Alternative, undetermined
 from sq_perception.fitting.starts import resized
@@ -40,8 +49,8 @@ from sq_perception.imaging import regions
 _SETTLED, _UNSURE = 1.03, 0.01
 """Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
 valleys of the cost are tried; chosen on benchmarks/single_body."""
-_FIRST_STEPS, _HOPELESS = 5, 2.0
-"""First steps of a rival, and its cost then, as a multiple of the body's at hand, from which on it is given up."""
+_OTHER_SIZES = (0.5, 1.4)
+"""Factors of the half size of rivals."""
 _FACE_SHARE = 0.04
 """Share of all rays that have a depth in common, from which on it is that of a face."""
 _DEAD_ZONE = 0.5 * 1.01
@@ -65,63 +74,38 @@ _NO_EVIDENCE = 12.5
 """Excess of a cost that is no evidence against a length: through noise its standard deviation is 7."""
 _OVAL = 0.25
 """Share of things that are not round among those of which the image does not tell."""
-_THIN = 0.3
-"""Half size, as a share of the other two, at which one that the image leaves open is also tried."""
 _EXPECTATION_SIGMA = 0.25
 """Sigma of a log half size from a predicted body's: its errors on household things, of which one in ten is far off."""
 
 
 def explore(solution: Solution) -> Solution:
-    """The solution of an exact superquadric after a search of other valleys, of which noise and a poor view may hide a
-    deeper one.
+    """The best superquadric once other valleys were searched, of which noise and a poor view may hide a deeper one.
 
-    Rivals are the same body with a half size that the image hardly determines made smaller or larger, the seen face in
-    place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.  They
-    are fitted with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
+    Rivals are the same body with the half size that the image determines least made smaller or larger, the seen face in
+    place, turned by 45 degrees, and the same box with each of its other axes as z.  They are fitted with the rendered
+    residual: Sampson's would make them grow, as g is convex and noise enters it.  Those that are no better are
+    alternatives.
     """
-    found: list[State] = []
-    while True:
-        best = solution.state
-        unexplained = solution.misfit > _SETTLED
-        unsure = solution.unsure()
-        if solution.problem.late or not (unexplained or unsure.max() > _UNSURE):
-            break
-        rivals = starts.other_depths(best, int(np.argmax(unsure)))
-        if unexplained:
-            rivals += starts.other_axes(best)
-        refined = _refine(solution, rivals)
-        found += refined
-        better = by_cost(refined)[0] if refined else best
+    problem, rays, others = solution.problem, solution.rays, list[State]()
+    while not problem.late and (solution.misfit > _SETTLED or solution.unsure().max() > _UNSURE):
+        best, axis = solution.state, int(np.argmax(solution.unsure()))
+        sizes = best.parameters[axis] * np.array(_OTHER_SIZES)
+        rivals = [*(resized(best, axis, size) for size in sizes), starts.turned(best), *starts.other_orders(best)]
+        # On other rays the body may already find its way out of a shallow valley.
+        reference, *settled = problem.advance([best, *rivals], SETTLE)
+        near = [state for state in distinct(by_cost(settled)) if state.cost < reference.cost + SLACK]
+        found = [problem.refine(state, rays) for state in near if not alike(state, reference)]
+        better = min(found, key=lambda state: state.cost, default=best)
+        others += found
         if better.cost >= best.cost - SIGNIFICANT:
             break
-        found.append(best)
+        others.append(best)
         solution = replace(solution, state=better)
-    others = [state for state in found if not alike(state, best)]
-    if not others:
-        return solution
+    best = solution.state
+    others = [state for state in others if not alike(state, best)]
     weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
     more = (Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))
     return solution.annotate(alternatives=(*solution.alternatives, *more))
-
-
-def _refine(solution: Solution, rivals: list[State]) -> list[State]:
-    """Rivals on all rays: those that hold on few, one a valley, and not in that of the body at hand."""
-    problem, best = solution.problem, solution.state
-    few = problem.draw(SETTLE.rays, SETTLE.offset)
-    reference = problem.descend(best, few)
-    hopeless, chosen = _HOPELESS * reference.cost, [best._replace(cost=reference.cost)]
-    # On other rays the body may already find its way out of a shallow valley.
-    settled = [reference]
-    for rival in rivals:
-        state = problem.descend(rival, few, _FIRST_STEPS)
-        if state.cost < hopeless:
-            settled.append(problem.descend(state, few, SETTLE.steps - _FIRST_STEPS))
-        if problem.late:
-            break
-    for state in by_cost(settled):
-        if state.cost < reference.cost + SLACK and not any(alike(state, other) for other in chosen):
-            chosen.append(state)
-    return [problem.refine(state, solution.rays) for state in chosen[1 : 1 + SETTLE.kept]]
 
 
 # Open half sizes
@@ -140,7 +124,7 @@ def weigh_depths(solution: Solution) -> Solution:
 def weigh_open_sizes(solution: Solution) -> Solution:
     """The solution, or a better one once half sizes that the image leaves open are left to priors and a prediction.
 
-    Of a thing each competes with bodies of which that size is like the other two, or thin.
+    Of a thing each competes with bodies of which that size is like the other two.
     """
     problem, state, rays, expected = solution.problem, solution.state, solution.rays, solution.problem.options.expected
     if problem.has_hull or (expected is None and problem.independent is None):
@@ -152,7 +136,7 @@ def weigh_open_sizes(solution: Solution) -> Solution:
     if problem.independent is not None:
         for k in weak:
             typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
-            rivals += [resized(state, k, share * typical) for share in (1.0, _THIN)]
+            rivals.append(resized(state, k, typical))
     if expected is not None:
         prior = expected() if callable(expected) else expected
         extents = prior.support(state.rotation.T)
