@@ -1,15 +1,12 @@
 """What a configured node holds is not searched for garbage; its threads share heaps; a start that fails says why."""
 
-from __future__ import annotations
-
 import gc
 import platform
-import subprocess
-import sys
 import weakref
 from typing import ClassVar
 
 import pytest
+from python_process import run_python
 
 from sq_perception.nodes import process
 
@@ -72,8 +69,7 @@ c.fflush(out)
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries have other heaps")
 def test_threads_share_heaps():
     def heaps(first: str) -> int:
-        command = [sys.executable, "-c", HEAPS.format(first=first)]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.count("<heap nr=")
+        return run_python("-c", HEAPS.format(first=first)).stdout.count("<heap nr=")
 
     assert heaps("") > 2
     assert heaps("process.share_heaps()") == 2
