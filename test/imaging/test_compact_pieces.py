@@ -1,7 +1,5 @@
 """Compact pieces of a set of cells: all of it, none twice, of about one size."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

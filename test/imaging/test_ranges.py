@@ -1,7 +1,5 @@
 """A support that bends like a sphere around the camera is told from a flat one, and from one that bends itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import Table, noisy

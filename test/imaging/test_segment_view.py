@@ -1,7 +1,5 @@
 """The view of a segment in its surroundings: what cells show, and which pixels they lie on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

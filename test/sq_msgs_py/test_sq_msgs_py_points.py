@@ -1,7 +1,5 @@
 """Points of a cloud as they lie in it: any byte order, number type, padding and order of fields."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,20 +15,14 @@ KINDS = {"f4": 7, "f8": 8, "i2": 3}
 
 def message(kind: str = "f4", order: str = "<", names: str = "zyx", padding: int = 0) -> Any:
     size = np.dtype(kind).itemsize
-    step = 3 * size + padding
-    layout = np.dtype(
-        {"names": list(names), "formats": [order + kind] * 3, "offsets": [k * size for k in range(3)], "itemsize": step}
-    )
-    rows = np.zeros((2, 4 + padding), layout)
+    step, offsets = 3 * size + padding, {name: k * size for k, name in enumerate(names)}
+    layout = {"names": [*names], "formats": [order + kind] * 3, "offsets": [*offsets.values()], "itemsize": step}
+    rows = np.zeros((2, 4 + padding), np.dtype(layout))
     for name in names:
         rows[name][:, :4] = POINTS[..., "xyz".index(name)]
-    fields = [
-        SimpleNamespace(name=name, offset=k * size, datatype=KINDS[kind], count=1) for k, name in enumerate(names)
-    ]
-    return SimpleNamespace(
-        height=2, width=4, fields=fields, is_bigendian=order == ">", point_step=step, row_step=step * (4 + padding),
-        data=rows.tobytes(),
-    )
+    fields = [SimpleNamespace(name=name, offset=at, datatype=KINDS[kind], count=1) for name, at in offsets.items()]
+    steps = {"point_step": step, "row_step": step * (4 + padding)}
+    return SimpleNamespace(height=2, width=4, fields=fields, is_bigendian=order == ">", data=rows.tobytes(), **steps)
 
 
 @pytest.mark.parametrize("kind", KINDS)
