@@ -1,7 +1,5 @@
 """The networks without torch answer as the modules of torch do, for shipped weights and for random ones."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from pathlib import Path

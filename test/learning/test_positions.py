@@ -1,7 +1,5 @@
 """Views and bodies in other positions, and the mean of several answers, whichever of its forms each has."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions

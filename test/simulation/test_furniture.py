@@ -1,7 +1,5 @@
 """Things in and on furniture, and the room behind a table: what is seen of things stays, all else is none of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

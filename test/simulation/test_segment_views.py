@@ -1,7 +1,5 @@
 """Segments to train on: what is the object's, what is not, and what is unknown."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,15 +1,12 @@
 """Views of things: what the code for images makes of them, poses on the table, and the truth that comes with them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from sq_perception import Camera, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS, mirrored, support_of_union
 from sq_perception.imaging import canonical_view
-from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import COVERED, FLUSH, HIDDEN, NEAREST
 from sq_perception.imaging.raycast import render
 from sq_perception.simulation.household import KINDS, draw_thing
@@ -27,10 +24,8 @@ def alone(setting: Setting, camera: Camera | None = None) -> Setting:
 
 def finer(camera: Camera, times: int) -> Camera:
     """The same image with more pixels: centres are those of the pixels' middles."""
-    return Camera(
-        camera.width * times, camera.height * times, camera.fx * times, camera.fy * times,
-        (camera.cx + 0.5) * times - 0.5, (camera.cy + 0.5) * times - 0.5,
-    )
+    width, height, fx, fy = (times * each for each in (camera.width, camera.height, camera.fx, camera.fy))
+    return Camera(width, height, fx, fy, (camera.cx + 0.5) * times - 0.5, (camera.cy + 0.5) * times - 0.5)
 
 
 def flipped(bodies: Superquadric) -> Superquadric:
@@ -160,8 +155,7 @@ def test_one_sees_into_a_cup() -> None:
     closed, _ = render_things(body, np.zeros(1), NOTHING, np.zeros(0), camera)
     opened, thing = render_things(body, np.zeros(1), hole, np.zeros(1), camera, behind=2.0)
     assert closed[40, 40] == pytest.approx(0.45)
-    assert opened[40, 40] == pytest.approx(0.54)
-    assert opened[40, 15] == pytest.approx(closed[40, 15])
+    assert (opened[40, 40], opened[40, 15]) == (pytest.approx(0.54), pytest.approx(closed[40, 15]))
     assert thing[40, 15] == 0
     assert opened[0, 0] == 2.0
     assert thing[0, 0] == -1
@@ -198,13 +192,9 @@ def test_pixels_without_a_reading_are_hidden_where_asked_for(columns: int) -> No
     assert not (marked.hidden & (marked.image > 0)).any()
     # What the image does not show at all.
     window = np.s_[:, left + 3 :]
-    cut = canonical_view.from_mask(
-        depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60), missing_is_hidden=True
-    )
-    assert cut.hidden[:, 0].all()
-    assert not canonical_view.from_mask(
-        depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60)
-    ).hidden.any()
+    shown = depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60)
+    assert canonical_view.from_mask(*shown, missing_is_hidden=True).hidden[:, 0].all()
+    assert not canonical_view.from_mask(*shown).hidden.any()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])

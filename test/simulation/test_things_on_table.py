@@ -1,7 +1,5 @@
 """Scenes of household things: what touches, what carries, what is seen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
