@@ -1,7 +1,5 @@
 """What the ablation leaves out is there to be left out."""
 
-from __future__ import annotations
-
 import ablation
 import pytest
 

@@ -1,17 +1,14 @@
 """Things of known size in recorded frames: the figures of a scene whose truth is made here."""
 
-from __future__ import annotations
-
 import numpy as np
 import public_frames
 import pytest
 from camera_bias import far_side
 from common import tabletop
 
+from sq_perception import RecordedFrame, Recoverer
 from sq_perception.fitting.priors import HullPrior
 from sq_perception.geometry.union import DIRECTIONS
-from sq_perception.recordings.frame_file import RecordedFrame
-from sq_perception.recovery.recoverer import Recoverer
 
 SCENE = 3
 
@@ -28,17 +25,11 @@ def test_a_far_side_errs_by_what_was_added(rng: np.random.Generator) -> None:
 
 def test_a_scene_has_the_figures_of_its_truth() -> None:
     scene = tabletop.scene(SCENE)
-    objects = [
-        {
-            "label": each.label,
-            "name": each.thing.name,
-            "kind": each.thing.kind,
-            "size": each.thing.edges.tolist(),
-            "hull": each.thing.hull.tolist(),
-            "pose": np.block([[each.rotation, each.translation[:, None]], [np.zeros(3), 1.0]]).tolist(),
-        }
-        for each in scene.placed
-    ]
+    objects = []
+    for each in scene.placed:
+        thing = {"name": each.thing.name, "kind": each.thing.kind, "hull": each.thing.hull.tolist()}
+        pose = np.block([[each.rotation, each.translation[:, None]], [np.zeros(3), 1.0]]).tolist()
+        objects.append({**thing, "label": each.label, "size": each.thing.edges.tolist(), "pose": pose})
     frame = RecordedFrame(scene.depth, scene.camera, scene.labels, "scene")
     found, bodies = public_frames.answers("scene", {"sensor": "simulated", "objects": objects}, frame, Recoverer())
     figures = public_frames.summary(found)

@@ -1,7 +1,5 @@
 """What benchmarks of things build on: IoU and hulls, against the package's own."""
 
-from __future__ import annotations
-
 import household_things
 import numpy as np
 import pytest

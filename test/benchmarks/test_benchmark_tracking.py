@@ -1,13 +1,10 @@
 """What the benchmark of tracking measures with: errors whatever the axes are called, and whose segment is whose."""
 
-from __future__ import annotations
-
 import numpy as np
 import tracking
 
-from sq_perception.fitting.fit import Fit, Status
-from sq_perception.geometry import Superquadric, rotation
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+from sq_perception import Fit, FrameRecovery, Recovery, Status, Superquadric
+from sq_perception.geometry import rotation
 from sq_perception.tracking.association import TURNS
 
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])

@@ -1,7 +1,5 @@
 """The second camera of the benchmark sees the scene of the first one."""
 
-from __future__ import annotations
-
 import numpy as np
 import two_cameras
 

@@ -1,7 +1,5 @@
 """Numbers of the package that a benchmark varies: they get other values, and their own ones back."""
 
-from __future__ import annotations
-
 from common.package_constants import constants, varied
 
 from sq_perception.segmentation.options import SegmentationOptions

@@ -1,7 +1,5 @@
 """What all commands have in common: what is read stays, what is printed arrives, and every name will do."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """sq-perception recover on many frames: order, meshes, and what stays whole when it is interrupted."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct
@@ -18,18 +16,17 @@ import yaml
 from recover_runs import BODIES, CAMERA, camera_yaml, recover, run, save_npz, save_png
 from table_scenes import VGA, Table
 
+from sq_perception import Recoverer, Superquadric
 from sq_perception.commands import main
 from sq_perception.commands.console import complain
 from sq_perception.commands.recover_run import lines
 from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import COLOURS
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
-from sq_perception.recovery.recoverer import Recoverer
 
 
 @pytest.fixture
@@ -43,9 +40,6 @@ def validate(repository):
 
 def body_of(entry):
     return Superquadric(entry["size"], entry["shape"], entry["translation"], entry["rotation"])
-
-
-# inputs
 
 
 def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
@@ -194,9 +188,6 @@ def test_counts_and_budgets_are_positive_and_a_score_is_from_0_to_1(tmp_path, op
     """Of a frame that was recovered with another score, nothing was left, and no JSON could be written."""
     assert run(save_npz(tmp_path / "a.npz"), f"{option}={value}", "--json", tmp_path / "out.json") == 2
     assert option + words in capsys.readouterr().err
-
-
-# outputs
 
 
 @pytest.mark.parametrize("kind", ["glb", "ply"])

@@ -1,18 +1,16 @@
 """What ``import sq_perception`` offers: the names, their price, and the lines of the README that use them."""
 
-from __future__ import annotations
-
 import ast
 import json
 import pkgutil
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from python_process import run_python
 
 import sq_perception
 
@@ -66,17 +64,11 @@ def test_names_are_loaded_when_they_are_used() -> None:
         "from sq_perception import *\n"
         "assert Recoverer.__module__ == 'sq_perception.recovery.recoverer'\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
+    run_python("-c", code)
 
 
 def snippets(page: Path) -> list[str]:
     return _SNIPPET.findall(page.read_text(encoding="utf-8"))
-
-
-def run(words: list[str], folder: Path) -> str:
-    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_the_readme_runs_as_it_stands(repository: Path, tmp_path: Path) -> None:
@@ -85,7 +77,7 @@ def test_the_readme_runs_as_it_stands(repository: Path, tmp_path: Path) -> None:
     blocks = re.findall(r"^```sh\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     (block,) = (block for block in blocks if "sq-perception sample" in block)
     lines = [line.partition("#")[0].split() for line in block.splitlines()]
-    true, *_ = [run([sys.executable, "-m", "sq_perception", *line[1:]], tmp_path) for line in lines]
+    true, *_ = [run_python("-m", "sq_perception", *line[1:], cwd=tmp_path).stdout for line in lines]
     result = json.loads((tmp_path / "result.json").read_text())
     found = [sorted(2e3 * half for half in body["size"]) for body in result["frames"][0]["superquadrics"]]
     known = [sorted(map(float, edges)) for edges in re.findall(r"(\d+) x (\d+) x (\d+) mm", true)]
@@ -98,7 +90,7 @@ def test_the_readme_runs_as_it_stands(repository: Path, tmp_path: Path) -> None:
     assert (tmp_path / "pictures" / "table.png").is_file()
 
     script = snippets(repository / "README.md")[0]
-    said = run([sys.executable, "-c", script], tmp_path)
+    said = run_python("-c", script, cwd=tmp_path).stdout
     assert re.findall(r"^(\d) (converged|weak): full edges \[.*\] mm \+- \[.*\] mm$", said, re.MULTILINE), said
     assert (tmp_path / "table.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "table.glb").read_bytes()[:4] == b"glTF"
@@ -109,8 +101,7 @@ def test_the_reader_of_the_outputs_page_runs(repository: Path) -> None:
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     script = snippets(repository / "docs" / "outputs.md")[0]
     code = f"import rclpy; rclpy.spin = lambda node: print(node.get_name())\n{script}\nprint(read.__name__)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True)
-    assert done.stdout.split() == ["reader", "read"]
+    assert run_python("-c", code).stdout.split() == ["reader", "read"]
 
 
 def test_all_snippets_of_the_documents_are_python(repository: Path) -> None:

@@ -1,7 +1,5 @@
 """The Python of the documents runs, on things of the kind that its comments name."""
 
-from __future__ import annotations
-
 import re
 import sys
 from dataclasses import replace
@@ -12,9 +10,8 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Camera, Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 39.5, 29.5)
 BODY = Superquadric([0.05, 0.04, 0.06], [0.2, 0.9], [0.0, 0.0, 0.5], [0.7, 0.1, 0.1, 0.7])
@@ -23,17 +20,9 @@ BODY = Superquadric([0.05, 0.04, 0.06], [0.2, 0.9], [0.0, 0.0, 0.5], [0.7, 0.1, 
 def names() -> dict[str, Any]:
     depth, index = raycast.render(BODY, CAMERA)
     depth = np.where(np.isfinite(depth), depth, 0.8).astype(np.float32)
-    return {
-        "depth": depth,
-        "mask": index >= 0,
-        "camera": CAMERA,
-        "last_body": BODY,
-        "table": np.array([0.0, 0.0, -1.0, 0.8]),
-        "true_depth": depth,
-        "rng": np.random.default_rng(1),
-        "z": np.array([0.5]),
-        "cosine": np.array([0.7]),
-    }
+    seen = {"depth": depth, "mask": index >= 0, "camera": CAMERA, "last_body": BODY, "true_depth": depth}
+    known = {"rng": np.random.default_rng(1), "z": np.array([0.5]), "cosine": np.array([0.7])}
+    return {**seen, **known, "table": np.array([0.0, 0.0, -1.0, 0.8])}
 
 
 def run(repository: Path, page: str, given: dict[str, Any]) -> dict[str, Any]:
@@ -71,10 +60,8 @@ def test_tracking(repository: Path) -> None:
 
     depth = names()["depth"]
     frames = [(0.1 * k, depth, np.eye(4)) for k in range(2)]
-    given = run(
-        repository, "tracking.md", {"frames": frames, "recoverer": Recoverer(method="symmetry"), "camera": CAMERA}
-    )
-    assert given["track"].observation == 0
+    given = {"frames": frames, "recoverer": Recoverer(method="symmetry"), "camera": CAMERA}
+    assert run(repository, "tracking.md", given)["track"].observation == 0
 
 
 def test_outputs(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

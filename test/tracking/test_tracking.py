@@ -1,7 +1,5 @@
 """Tracking: ids that last through crossings, hands and hiding, whatever frame the world has."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
@@ -23,10 +21,8 @@ from tracked_bodies import (
     spread_bodies,
 )
 
+from sq_perception import Camera, Recoverer, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
 from sq_perception.simulation.sensor_noise import Ideal
 from sq_perception.tracking import association, state, visibility
@@ -229,9 +225,6 @@ def test_a_long_gap_forgets_the_pose_and_keeps_the_sizes(rng):
     assert not track.velocity.any()
 
 
-# Frames
-
-
 def test_a_motion_of_the_world_changes_nothing(rng):
     """All poses moved rigidly: the same numbers, moved."""
     turn, shift = quaternions.random(1, rng)[0], np.array([1.0, -2.0, 0.5])
@@ -338,9 +331,6 @@ def test_what_was_handed_out_is_the_callers(rng):
     assert not after.velocity.any()
 
 
-# The real chain
-
-
 def frames_about(shown, count, step, rng, sigma=0.001):
     """Recovered frames of a camera that is carried about the middle of a table, with its poses and depth images."""
     middle = np.array([0, 0, shown.bodies.translation[:, 2].mean()])
@@ -394,9 +384,6 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
             last[track.id] = track.superquadric
     assert set(last) == {1, 2}
     assert len(named) > 2
-
-
-# What a node does without SciPy
 
 
 def test_the_limits_of_chi_squared_are_scipys():

@@ -1,7 +1,5 @@
 """A still scene, whose axes keep their names, and several cameras: what one leaves open another one tells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from tracked_bodies import (
@@ -19,8 +17,7 @@ from tracked_bodies import (
 )
 from tracked_bodies import angle_between as turn
 
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.recovery.recoverer import Recoverer
+from sq_perception import Recoverer, Superquadric
 from sq_perception.simulation.scenes import table_scene
 from sq_perception.simulation.sensor_noise import preset
 from sq_perception.tracking import state
@@ -83,6 +80,7 @@ def test_two_cameras_across_each_other_leave_no_size_open(rng):
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
 def test_every_body_is_there_once_whoever_sees_it(order, rng):
     """The third camera sees but one of two bodies: a wall hides the other one from it."""
+    assert fuse_views([]) == ()
     truths = spread_bodies(2, rng)
     wall = Superquadric([0.15, 0.3, 0.01], [0.1, 0.1], [0.3, 0.0, 0.4], [0, 0, 0, 1.0])
     views = []
@@ -98,7 +96,3 @@ def test_every_body_is_there_once_whoever_sees_it(order, rng):
     for truth in truths:
         (track,) = (each for each in tracks if np.linalg.norm(each.superquadric.translation - truth.translation) < 0.05)
         assert np.linalg.norm(state.difference(truth.to_flat(), track.superquadric.to_flat())[5:8]) < 0.01
-
-
-def test_no_view_has_no_body():
-    assert fuse_views([]) == ()
