@@ -70,7 +70,9 @@ def test_an_archive_is_the_same_camera(tmp_path, names):
     assert read_calibration(tmp_path / "camera.npz", size=SIZE).camera == CAMERA
 
 
-def test_distortion_comes_along(tmp_path):
+def test_distortion_comes_along_and_three_numbers_are_no_camera(tmp_path):
+    with pytest.raises(FrameError, match="expected four numbers, fx,fy,cx,cy, got 3"):
+        read_calibration("60,61,31.5", size=SIZE)
     path = tmp_path / "cam.yaml"
     path.write_text("Camera.fx: 60\nCamera.fy: 61\nCamera.cx: 31.5\nCamera.cy: 23.5\nCamera.k1: 0.1\nCamera.p2: 0.01\n")
     assert read_camera_info(path, SIZE).d[:4] == (0.1, 0, 0, 0.01)
@@ -123,8 +125,6 @@ def test_what_is_no_camera_is_named(tmp_path, name, text, said):
     (tmp_path / name).write_text(text)
     with pytest.raises(FrameError, match=said):
         read_calibration(tmp_path / name, size=SIZE)
-    with pytest.raises(FrameError, match="expected four numbers, fx,fy,cx,cy, got 3"):
-        read_calibration("60,61,31.5", size=SIZE)
 
 
 def scene(folder, scale):
