@@ -35,6 +35,10 @@ FORMS = {
     "four.txt": "60.0 61.0 31.5 23.5\n",
     "four.csv": "60.0,61.0,31.5,23.5",
     "nine.txt": " ".join(map(str, ROWS)),
+    "lines.txt": "60 0 31.5\n0 61 23.5\n0 0 1\n",
+    "plain.yaml": "fx: 60\nfy: 61\ncx: 31.5\ncy: 23.5\n",
+    "one_scene.json": json.dumps({"cam_K": ROWS}),
+    "scaled.json": json.dumps({"fx": 60, "fy": 61, "cx": 31.5, "cy": 23.5, "depth_scale": 1.0}),
     "sixteen.csv": "60,0,31.5,0\n0,61,23.5,0\n0,0,1,0\n0,0,0,1\n",
     "scannet.txt": "fx_color = 1170.1\nfy_color = 1170.1\nmx_color = 647.7\ncolorWidth = 1296\ncolorHeight = 968\n"
     "depthWidth = 64\ndepthHeight = 48\nm_calibrationColorIntrinsic = 1170 0 647 0 0 1170 483 0 0 0 1 0 0 0 0 1\n"
