@@ -1,7 +1,5 @@
 """What all tests share: the data beside the repository, the source tree, and a ROS domain of their own."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import resource
@@ -19,7 +17,7 @@ import sq_perception
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 _STARTING = {
-    *("subprocess", "browser", "sealed_network"),
+    *("subprocess", "browser", "python_process", "sealed_network"),
     *("started_nodes", "running_nodes", "respawned_nodes", "hostile_messages"),
 }
 """Modules by which tests start processes."""

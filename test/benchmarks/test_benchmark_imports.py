@@ -1,12 +1,9 @@
 """A benchmark read by another program changes nothing there; those that share helpers with the tests find them."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from python_process import run_python
 
 IMPORT = """
 import os, sys
@@ -23,14 +20,10 @@ READ = "constants", "frame_time", "real_scenes", "segmentation", "single_body", 
 
 def test_an_import_leaves_the_number_of_threads_alone(repository: Path) -> None:
     # Numba refuses to compile once its threads run and NUMBA_NUM_THREADS names another number.
-    command = [sys.executable, "-c", IMPORT, str(repository / "benchmarks"), *READ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    run_python("-c", IMPORT, repository / "benchmarks", *READ)
 
 
 @pytest.mark.parametrize("name", ["hostile", "kills", "soak"])
 def test_helpers_of_the_tests_are_found(name: str, repository: Path) -> None:
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
-    command = [sys.executable, str(repository / "benchmarks" / f"{name}.py"), "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
+    run_python(repository / "benchmarks" / f"{name}.py", "--help")

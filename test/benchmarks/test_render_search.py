@@ -1,7 +1,5 @@
 """The grid search of figure 7.6: what it computes, and that the script draws it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

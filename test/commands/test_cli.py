@@ -1,18 +1,22 @@
 """The command line: the public contract of its files, its exit codes, and a help that answers at once."""
 
-from __future__ import annotations
-
+import io
 import json
+import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from python_process import run_python
+from recover_runs import run
 
 import sq_perception
 from sq_perception.commands import main
+from sq_perception.commands.console import progress
 from sq_perception.geometry.metrics import thesis_iou, volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -56,16 +60,14 @@ def test_rendered_cube_images_come_back(tmp_path, suffix):
     assert main.main(["render", *CUBE_BODY, "-o", str(path)]) == 0
     assert recover(path, "--json", out, "--ignore-masks") == 0
     frame = strict(out.read_text())["frames"][0]
-    assert frame["file"] == str(path)
-    assert frame["coordinates"] == "cube"
+    assert (frame["file"], frame["coordinates"]) == (str(path), "cube")
     assert frame["ms"] > 0
     (entry,) = frame["superquadrics"]
     assert set(entry) == KEYS
     assert entry["label"] is None
     assert entry["status"] in ("converged", "weak")
     assert thesis_iou(body_of(entry), flat(CUBE_BODY)) > 0.98
-    assert len(entry["sigma_size"]) == 3
-    assert len(entry["seen"]) == 3
+    assert (len(entry["sigma_size"]), len(entry["seen"])) == (3, 3)
     assert all(0 <= share <= 1 for share in entry["seen"])
     assert entry["track"] is None
 
@@ -128,16 +130,12 @@ def test_masks_name_the_bodies_and_unknown_is_null(tmp_path, view):
     assert (first["label"], second["label"]) == (200, 7)
     assert second["status"] == "failed"
     assert second["residual"] is None
-    assert second["sigma_size"] == [None, None, None]
-    assert second["score"] == 0
+    assert (second["sigma_size"], second["score"]) == ([None, None, None], 0)
 
 
-def test_json_on_the_standard_output_is_only_json(view, capsys):
+def test_a_line_is_printed_for_each_body_or_nothing_but_json(view, capsys):
     assert recover(view, "--json", "-") == 0
     assert len(strict(capsys.readouterr().out)["frames"]) == 1
-
-
-def test_without_json_a_line_is_printed_for_each_body(view, capsys):
     assert recover(view) == 0
     number = r"0\.\d{3,4}"
     sizes, deviations = " x ".join([number] * 3), r" \+-".join([number] * 3)
@@ -163,35 +161,22 @@ def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
     assert "no such model file" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        [],
-        ["recover"],
-        ["fly"],
-        ["recover", "a.npz", "--method", "magic"],
-        ["recover", "a.npz", "--projection", "fisheye"],
-        ["recover", "a.npz", "--json", "no/such/folder/out.json"],
-        ["recover", "a.npz", "--max-objects", "0"],
-        ["render", "1", "2", "3", "--output", "x.png"],
-        ["render", *CUBE_BODY],
-        ["render", *CUBE_BODY, "--output", "x.jpg"],
-        ["render", *CAN, "--projection", "pinhole", "--output", "x.bmp"],
-        ["render", "-1", *CUBE_BODY[1:], "--output", "x.png"],
-        ["render", *CUBE_BODY[:8], "0", "0", "0", "0", "--output", "x.png"],
-        ["render", *CUBE_BODY, "--output", "x.png", "--width", "1"],
-        ["render", *CUBE_BODY, "--output", "x.png", "--width", "0"],
-        ["render", *CUBE_BODY, "--output", "x.png", "--width", "1000000"],
-        ["render", *CUBE_BODY, "--output", "x.png", "--width", "1000001", "--height", "2"],
-        ["render", *CAN, "--projection", "pinhole", "--output", "x.npz", "--width", "100000", "--height", "100000"],
-        ["render", *CUBE_BODY, "--output", "x.png", "--focal", "500"],
-        ["render", *CAN, "--projection", "pinhole", "--output", "x.png", "--height", "0"],
-        ["render", *CUBE_BODY, "--output", "no/such/folder/x.png"],
-        ["render", "nan", *CUBE_BODY[1:], "--output", "x.png"],
-        ["train", "--seed", "-1"],
-        ["train", "--threads", "-1"],
-    ],
-)
+CUBE, PINHOLE = ["render", *CUBE_BODY, "-o"], ["render", *CAN, "--projection", "pinhole", "-o"]
+WRONG = [
+    *([], ["recover"], ["fly"], ["train", "--seed", "-1"], ["train", "--threads", "-1"]),
+    *(["recover", "a.npz", one] for one in ("--method=magic", "--projection=fisheye", "--max-objects=0")),
+    *(["recover", "a.npz", "--json", "no/such/folder/out.json"], ["render", "1", "2", "3", "-o", "x.png"], CUBE[:-1]),
+    *([*CUBE, "x.jpg"], [*PINHOLE, "x.bmp"], [*CUBE, "no/such/folder/x.png"], [*CUBE, "x.png", "--focal", "500"]),
+    *(["render", wrong, *CUBE_BODY[1:], "-o", "x.png"] for wrong in ("-1", "nan")),
+    ["render", *CUBE_BODY[:8], "0", "0", "0", "0", "-o", "x.png"],
+    *([*CUBE, "x.png", "--width", width] for width in ("1", "0", "1000000")),
+    [*CUBE, "x.png", "--width", "1000001", "--height", "2"],
+    [*PINHOLE, "x.npz", "--width", "100000", "--height", "100000"],
+    [*PINHOLE, "x.png", "--height", "0"],
+]
+
+
+@pytest.mark.parametrize("arguments", WRONG)
 def test_wrong_usage_is_code_two_and_no_traceback(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert main.main(arguments) == 2
@@ -208,37 +193,24 @@ def test_help_waits_for_nothing_that_computes():
         "for words in ([], *([name] for name in main.COMMANDS)):\n"
         f"    print('LOADED', *words, main.main([*words, '--help']), *sorted(set({HEAVY!r}) & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True)
+    done = run_python("-c", code)
     loaded = [line for line in done.stdout.splitlines() if line.startswith("LOADED")]
     assert loaded == ["LOADED 0", *(f"LOADED {name} 0" for name in main.COMMANDS)]
+    for words in ("--steps", "least_squares_free", "mse", "What is minimised", "Views a step", "--fit-bodies"):
+        assert words in done.stdout
     assert len(re.findall("^usage: sq-perception", done.stdout, re.MULTILINE)) == len(loaded)
 
 
 def test_the_package_runs_as_a_module_and_says_its_version():
-    command = [sys.executable, "-m", "sq_perception"]
-    done = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=600, check=True)
-    assert done.stdout == f"sq-perception {sq_perception.__version__}\n"
-    done = subprocess.run([*command, "recover", "--help"], capture_output=True, text=True, timeout=600, check=True)
-    assert "examples:" in done.stdout
+    version = run_python("-m", "sq_perception", "--version").stdout
+    assert version == f"sq-perception {sq_perception.__version__}\n"
+    assert "examples:" in run_python("-m", "sq_perception", "recover", "--help").stdout
 
 
 def test_demo_without_ros_says_what_is_missing(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "rclpy", None)
     assert main.main(["demo"]) == 1
     assert "demo needs ROS 2 in Python: pip install" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("train", ("--steps", "least_squares_free", "mse", "--points", "What is minimised", "Views a step")),
-        ("evaluate", ("--fit-bodies", "report.md")),
-    ],
-)
-def test_commands_have_a_help_of_their_own(command, words, capsys):
-    assert main.main([command, "--help"]) == main.SUCCESS
-    help_text = capsys.readouterr().out
-    assert all(word in help_text for word in words)
 
 
 def test_author_renders(shared_data, tmp_path):
@@ -250,3 +222,70 @@ def test_author_renders(shared_data, tmp_path):
     found = [body_of(frame["superquadrics"][0]) for frame in strict(out.read_text())["frames"]]
     truth = Superquadric(rows[:, 0:3] / 255, rows[:, 3:5], rows[:, 5:8] / 255, rows[:, -4:])
     assert (thesis_iou(Superquadric.stack(found), truth) > 0.97).all()
+
+
+def test_a_file_that_is_called_like_the_standard_output_is_no_output(tmp_path, monkeypatch, capsys):
+    """It is read where masks or the files of a bag are."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((30, 40), np.uint16))
+    (tmp_path / "-").write_text("what somebody has left")
+    monkeypatch.chdir(tmp_path)
+    assert run("a.png", "--camera-info", "50,50,19.5,14.5", "--masks", ".", "--json", "-") == 0
+    assert "input" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [("/dev/full", "sq-perception: the standard output: No space left on device\n"), ("a closed pipe", "")],
+)
+def test_what_cannot_be_printed_is_code_one_and_no_exception(output, words):
+    """Buffered, as in a user's shell, so that it fails when all is done."""
+    into, of = os.pipe()
+    os.close(into)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with os.fdopen(of, "wb") if output == "a closed pipe" else open(output, "wb") as sink:
+        command = [sys.executable, "-m", "sq_perception", "--version"]
+        done = subprocess.run(command, stdout=sink, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (1, words)
+
+
+def test_json_on_a_closed_standard_output_is_wrong_usage(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert run(tmp_path / "a.npz", "--json", "-") == 2
+    assert "--json: the standard output is closed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [b"$1$_$2_$.npz", b"caf\xe9.npz"])
+def test_a_frame_may_be_called_anything(tmp_path, name, monkeypatch):
+    """What Matplotlib takes for a formula, and what is no UTF-8, in pictures, meshes, tables and on the terminal."""
+    path = Path(os.fsdecode(os.path.join(os.fsencode(tmp_path), name)))
+    depth = np.full((30, 40), 1.0, np.float32)
+    depth[8:22, 10:30] = 0.8
+    np.savez(path, depth=depth, K=[[50, 0, 19.5], [0, 50, 14.5], [0, 0, 1]], labels=(depth < 0.9).astype(int))
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
+    outputs = ("--pictures", tmp_path, "--meshes", tmp_path, "--csv", tmp_path / "out.csv")
+    assert run(path, *outputs) == 0
+    assert sys.stdout.buffer.getvalue()
+    assert {found.suffix for found in tmp_path.iterdir()} == {".npz", ".png", ".glb", ".csv"}
+    assert "weak" in (tmp_path / "out.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", ["train-things", "train-masks"])
+def test_a_training_that_is_interrupted_says_so_by_its_code(tmp_path, command, monkeypatch, capsys):
+    pytest.importorskip("torch", reason="needs the extra 'train'")
+    from sq_perception.learning import shard_training
+    from sq_perception.learning.training import Stopped
+
+    def interrupted(*_):
+        raise Stopped("the same command goes on")
+
+    monkeypatch.setattr(shard_training, "train", interrupted)
+    assert main.main([command, str(tmp_path), "--output", str(tmp_path)]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_a_bar_that_no_terminal_shows_writes_nothing(capsys):
+    """Not even an empty line, as rich before 14.3 ends it with."""
+    with progress() as bar:
+        bar.add_task("recovering", total=1)
+        bar.console.line()
+    assert capsys.readouterr().err == ""

@@ -1,7 +1,5 @@
 """``sq-perception fit``: files of clouds and meshes in, lines and JSON out; and ``recover``, given what is for it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -12,9 +10,7 @@ import trimesh
 from sq_perception.commands.main import main
 from sq_perception.geometry.superquadric import Superquadric
 
-BODY = Superquadric(
-    np.array([0.03, 0.04, 0.09]), np.array([0.2, 1.0]), np.array([0.02, -0.03, 0.6]), np.array([0.2, 0.1, 0.0, 1.0])
-)
+BODY = Superquadric([0.03, 0.04, 0.09], [0.2, 1.0], [0.02, -0.03, 0.6], [0.2, 0.1, 0.0, 1.0])
 
 
 @pytest.fixture
@@ -48,9 +44,7 @@ def test_meshes_and_arrays_are_read_and_parts_found(tmp_path: Path, capsys: pyte
     assert [len(entry["superquadrics"]) for entry in found] == [1, 1]
 
 
-def test_what_cannot_be_read_is_said_and_the_rest_follows(
-    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_read_is_said_and_the_rest_follows(whole, tmp_path, capsys) -> None:
     broken = tmp_path / "broken.ply"
     broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9999999\nend_header\n")
     assert main(["fit", str(broken), str(tmp_path / "none.stl"), str(tmp_path / "some.txt"), str(whole)]) == 1

@@ -1,22 +1,17 @@
 """sq-perception doctor says what is there; warm-up compiles all that frames call, so that no camera waits for it."""
 
-from __future__ import annotations
-
 import os
-import subprocess
 import sys
 
 import numpy as np
 import trimesh
 from numba.core.dispatcher import Dispatcher
+from python_process import run_python
 
-from sq_perception import __version__
+from sq_perception import Camera, Recoverer, __version__, fit_mesh, fit_points
 from sq_perception.commands import installation, main
 from sq_perception.fitting import levenberg_marquardt, point_cost
 from sq_perception.fitting.decomposition import decompose
-from sq_perception.fitting.points import fit_mesh, fit_points
-from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import TABLE_CAMERA, draw_crowd, table_scene
 
 
@@ -42,9 +37,7 @@ def test_sources_without_their_requirements_are_a_fault():
     """Run from a checkout nothing says what is required, but the kernels cannot be loaded."""
     code = "import sys; sys.modules['numba'] = None; from sq_perception.commands.installation import doctor; "
     code += "sys.exit(doctor([]))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 1
-    assert "cannot be loaded: " in done.stdout
+    assert "cannot be loaded: " in run_python("-c", code, code=1).stdout
 
 
 def test_kernels_of_other_sources_are_told_from_none(tmp_path):
@@ -63,8 +56,7 @@ said += [installation._kernels()[0]]
 file.rename(file.with_name("kernels.gauge_0123456789ab-1.nbi"))
 print(*said, installation._kernels()[0], sep="\\n")
 """
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    done = run_python("-c", code, env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)})
     told = [line.partition(str(tmp_path))[0].strip() for line in done.stdout.splitlines()]
     other = "compiled for other sources: sq-perception warm-up; they go to"
     assert told == [other.replace("compiled for other sources", "not compiled yet"), "compiled, in", other, other]

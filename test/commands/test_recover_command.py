@@ -1,7 +1,5 @@
 """sq-perception recover on many frames: order, meshes, and what stays whole when it is interrupted."""
 
-from __future__ import annotations
-
 import json
 import os
 import struct
@@ -18,18 +16,17 @@ import yaml
 from recover_runs import BODIES, CAMERA, camera_yaml, recover, run, save_npz, save_png
 from table_scenes import VGA, Table
 
+from sq_perception import Recoverer, Superquadric
 from sq_perception.commands import main
 from sq_perception.commands.console import complain
 from sq_perception.commands.recover_run import lines
 from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import COLOURS
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
-from sq_perception.recovery.recoverer import Recoverer
 
 
 @pytest.fixture
@@ -43,9 +40,6 @@ def validate(repository):
 
 def body_of(entry):
     return Superquadric(entry["size"], entry["shape"], entry["translation"], entry["rotation"])
-
-
-# inputs
 
 
 def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
@@ -97,18 +91,12 @@ def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch
     assert [isinstance(frame, FrameError) for _, frame in found] == [False, True, False]
 
 
-def test_folders_are_looked_into_to_a_depth_that_is_said(tmp_path, caplog):
-    near, _ = save_npz(tmp_path / "1/2/3/4/f.npz"), save_npz(tmp_path / "a/b/c/d/e/f.npz")
+def test_folders_are_looked_into_to_a_depth_that_is_said_and_depth_images_stand_for_their_siblings(tmp_path, caplog):
+    near, *_ = (save_npz(tmp_path / f"{folder}/f.npz") for folder in ("1/2/3/depth", "1/2/3/rgb", "a/b/c/d/e"))
     with caplog.at_level("WARNING"):
         found = RecordedInput([str(tmp_path)])
     assert [file for file, _ in found] == [str(near)]
     assert "for 4 levels, and not farther down" in caplog.text
-
-
-def test_a_folder_of_depth_images_stands_for_its_siblings(tmp_path):
-    for folder in ("depth", "mask", "rgb"):
-        save_npz(tmp_path / folder / "f.npz")
-    assert [file for file, _ in RecordedInput([str(tmp_path)])] == [str(tmp_path / "depth" / "f.npz")]
 
 
 def test_names_that_are_no_utf_8_are_valid_json_and_are_resumed(tmp_path, capsys):
@@ -145,24 +133,20 @@ def test_decoders_write_nothing_themselves(tmp_path):
     assert sum("not a readable image" in line for line in errors) >= 2
 
 
-def test_a_name_that_cannot_even_be_looked_at_costs_no_other_frame(tmp_path, capsys):
-    """As one in a folder without permission; here one that is too long."""
-    (frame,) = recover(tmp_path, tmp_path / (300 * "a"), save_npz(tmp_path / "a.npz"), code=1)
-    assert frame["file"] == str(tmp_path / "a.npz")
-    errors = capsys.readouterr().err
-    assert "File name too long" in errors
-    assert "1 frame or source unreadable" in errors
-
-
-def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
+def test_bad_inputs_come_as_errors_in_their_place(tmp_path, capsys):
+    """One cannot even be looked at, as in a folder without permission: here its name is too long."""
     empty = tmp_path / "empty"
     empty.mkdir()
     good, bad = save_npz(tmp_path / "good.npz"), tmp_path / "bad.npz"
     bad.write_bytes(b"nothing")
-    names = [str(path) for path in (empty, bad, good, tmp_path / "missing", save_png(tmp_path / "lone.png"))]
+    lone, missing, long = save_png(tmp_path / "lone.png"), tmp_path / "missing", tmp_path / (300 * "a")
+    names = [str(path) for path in (empty, bad, good, missing, lone, long)]
     found = [frame for _, frame in RecordedInput(names)]
-    assert [isinstance(frame, FrameError) for frame in found] == [True, True, False, True, True]
+    assert [isinstance(frame, FrameError) for frame in found] == [True, True, False, True, True, True]
     assert "no frames in it" in str(found[0])
+    assert "File name too long" in str(found[-1])
+    assert len(recover(tmp_path, *names, code=1)) == 1
+    assert "5 frames or sources unreadable" in capsys.readouterr().err
     with pytest.raises(FrameError, match=r"none\.yaml"):
         RecordedInput(names, InputOptions(tmp_path / "none.yaml"))
 
@@ -194,9 +178,6 @@ def test_counts_and_budgets_are_positive_and_a_score_is_from_0_to_1(tmp_path, op
     """Of a frame that was recovered with another score, nothing was left, and no JSON could be written."""
     assert run(save_npz(tmp_path / "a.npz"), f"{option}={value}", "--json", tmp_path / "out.json") == 2
     assert option + words in capsys.readouterr().err
-
-
-# outputs
 
 
 @pytest.mark.parametrize("kind", ["glb", "ply"])

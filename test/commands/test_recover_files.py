@@ -1,7 +1,5 @@
 """The files of sq-perception recover: whole when it is interrupted, resumed, and never in the place of an input."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

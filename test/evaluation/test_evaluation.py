@@ -1,7 +1,5 @@
 """The evaluation: its figures in closed form, its test set, its tables, and the files of the command."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -12,17 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from sq_perception import Recoverer, Superquadric
 from sq_perception.commands import main
 from sq_perception.evaluation import contest, evaluation_pictures, thesis_report
 from sq_perception.evaluation.contest import CAMERA, Answers, Contestant, ThesisImages, fit, network, unique_names
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, shortest_arc
 from sq_perception.evaluation.thesis_report import NOT_IN_THESIS, NOTHING, Table
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint
 from sq_perception.learning.networks import Regressor, RegressorConfig
-from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import thesis_bodies
 
 LABELS = ThesisImages(40).truth
@@ -50,19 +47,15 @@ def entry(name: str, loss: str | None, **changed: float) -> dict[str, Any]:
 
 
 class TestFigures:
-    def test_the_truth_itself_is_perfect(self) -> None:
+    def test_known_changes_have_their_closed_forms(self) -> None:
         figures = FiguresOfMerit.of(LABELS, LABELS)
-        assert (figures.iou == 1).all()
-        assert (figures.volume_iou == 1).all()
+        assert (np.stack([figures.iou, figures.volume_iou]) == 1).all()
         for error in (figures.delta_a, figures.delta_e, figures.delta_t, figures.shortest_arc, figures.axes_angle):
             assert np.abs(error).max() < 1e-7
-
-    def test_known_changes_have_their_closed_forms(self) -> None:
         shift = np.array([0.01, -0.02, 0.03])
         changed = Superquadric(1.1 * LABELS.size, 0.9 * LABELS.shape, LABELS.translation + shift, LABELS.rotation)
         found = FiguresOfMerit.of(changed, LABELS).summary()
-        assert found["delta_a"] == pytest.approx(1.1**3 - 1)
-        assert found["delta_e"] == pytest.approx(-0.1)
+        assert (found["delta_a"], found["delta_e"]) == (pytest.approx(1.1**3 - 1), pytest.approx(-0.1))
         assert found["delta_t"] == pytest.approx(tuple(shift))
         assert 0.4 < found["iou_mean"] < 1 / 1.1**3
 
@@ -167,9 +160,7 @@ class TestContest:
             assert np.isfinite(bodies).all(axis=1).tolist() == [True, False]
 
     @pytest.mark.parametrize("canonical", [False, True])
-    def test_what_is_given_is_that_of_the_label_as_the_training_listed_it(
-        self, tmp_path: Path, canonical: bool
-    ) -> None:
+    def test_what_is_given_is_that_of_the_label_as_the_training_listed_it(self, tmp_path, canonical) -> None:
         path = small_network(tmp_path / "a.safetensors", loss="occupancy_rotation", canonical_labels=canonical)
         alone = network(path)
         labels = alone.labels(LABELS)
@@ -190,24 +181,18 @@ class TestTables:
         titles = " ".join(table.title for table in tables)
         assert all(f"Table {number}" in titles for number in ("6.1", "6.2", "6.3", "7.1", "7.2", "7.3", "7.4"))
         for table in tables:
-            for row in table.rows:
-                for name, cell in zip(table.header, row, strict=True):
-                    ours = name not in ("Method",) and "thesis" not in name
-                    assert (cell == NOTHING) == ours
+            ours = [name != "Method" and "thesis" not in name for name in table.header]
+            assert all([cell == NOTHING for cell in row] == ours for row in table.rows)
 
     def test_losses_answer_the_rows_of_the_thesis(self) -> None:
-        results = [
-            entry("shipped", "occupancy", iou_mean=0.9),
-            entry("free", "least_squares_free", iou_mean=0.8),
-            entry("classic", None, iou_mean=0.7),
-            entry("auto", None, iou_mean=0.99),
-        ]
+        known = (("shipped", "occupancy", 0.9), ("free", "least_squares_free", 0.8))
+        known += (("classic", None, 0.7), ("auto", None, 0.99))
+        results = [entry(name, loss, iou_mean=iou) for name, loss, iou in known]
         tables = {table.title.split(":")[0]: table for table in thesis_report.thesis_tables(results)}
         rows = {row[0]: row for row in tables["Table 7.4"].rows}
         assert rows["supervised, L_OC"][1:4] == ("shipped", "90.00 ± 0.00 %", "94.62 ± 3.18 %")
         assert rows["Iterative (Solina and Bajcsy)"][1:4] == ("classic", "70.00 ± 0.00 %", "84.51 ± 8.89 %")
-        assert rows["unsupervised, L_LS and free space"][3] == NOT_IN_THESIS
-        assert rows["unsupervised, L_LS"][1] == NOTHING
+        assert (rows["unsupervised, L_LS and free space"][3], rows["unsupervised, L_LS"][1]) == (NOT_IN_THESIS, NOTHING)
         assert rows["supervised, L_OC"][4] == "not timed"
         assert not any("auto" in row for table in tables.values() for row in table.rows)
         assert [len(table.rows) for table in thesis_report.overview(results)] == [4, 4]
@@ -217,10 +202,8 @@ class TestTables:
         (table,) = (one for one in thesis_report.thesis_tables(results) if one.title.startswith("Table 7.2"))
         assert [row[1] for row in table.rows if row[0].endswith("L_DR")] == ["first", "second"]
 
-    def test_cells_are_escaped(self) -> None:
+    def test_cells_are_escaped_and_have_no_minus_zero(self) -> None:
         assert "a\\|L_OC" in Table("t", ("Method",), (("a|L_OC",),)).markdown()
-
-    def test_no_minus_zero(self) -> None:
         assert thesis_report.signed(-1e-6) == "+0.00 %"
 
 

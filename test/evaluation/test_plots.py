@@ -1,27 +1,23 @@
 """Pictures: outlines where the bodies are, views from where they say, and no global Matplotlib state."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 
 import cv2
 import numpy as np
 import pytest
+from python_process import run_python
 
+from sq_perception import Camera, Recoverer, Superquadric
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.recovery_figure import recovery_figure
 from sq_perception.geometry.mesh import outline
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import PANDA
 from sq_perception.grasping.plan import Grasp, GraspPlan
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import Recoverer
 
 CAMERA = Camera(160, 120, 135.0, 135.0, 79.5, 59.5)
 BODY = Superquadric([0.08, 0.06, 0.1], [0.3, 0.8], [0.02, 0.01, 0.7], [0.4, 0.2, 0.1, 0.9])
+IN_CUBE = unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5] * 3, BODY.rotation))
 PLANE = np.array([0.0, -1.0, 0.0, 0.15])
 
 
@@ -32,11 +28,7 @@ def shot(body=BODY, camera=CAMERA):
 
 @pytest.mark.parametrize("camera", [CAMERA, unit_cube.camera(96), Camera(2000, 1500, 1700, 1700, 999.5, 749.5)])
 def test_the_silhouette_encloses_the_pixels_of_the_body(camera):
-    body = (
-        BODY
-        if camera.is_pinhole
-        else unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5, 0.5, 0.5], BODY.rotation))
-    )
+    body = BODY if camera.is_pinhole else IN_CUBE
     _, index = raycast.render(body, camera)
     (loop,) = plots.silhouettes(body, camera)
     filled = np.zeros(index.shape, np.uint8)
@@ -50,10 +42,15 @@ def drawn(figure):
     return np.asarray(figure.canvas.buffer_rgba())[..., :3].astype(float)
 
 
+def one_picture(inches=(6.4, 4.8)):
+    """A figure and the axes that fill it."""
+    figure = plots.new_figure(*inches)
+    return figure, figure.add_axes((0, 0, 1, 1))
+
+
 def test_outlines_lie_on_the_depth_picture():
     depth, labels = shot()
-    figure = plots.new_figure(6.4, 4.8)
-    ax = figure.add_axes((0, 0, 1, 1))
+    figure, ax = one_picture()
     plots.draw_depth(ax, np.where(np.isfinite(depth), depth, 1.2))
     before = drawn(figure)
     plots.draw_outlines(ax, [BODY], CAMERA, edges=False)
@@ -67,8 +64,7 @@ def test_outlines_lie_on_the_depth_picture():
 def test_scores_of_grasps_can_be_read_where_the_picture_is_dark():
     """Where nothing is measured the picture is as dark as the letters."""
     grasp = Grasp(0, BODY.translation, np.array([0, 0, 0, 1.0]), 0.08, 0.06, 0.875, "")
-    figure = plots.new_figure(6.4, 4.8)
-    ax = figure.add_axes((0, 0, 1, 1))
+    figure, ax = one_picture()
     depth = np.full((CAMERA.height, CAMERA.width), np.nan)
     plots.draw_grasps(ax, depth, CAMERA, [BODY], GraspPlan((grasp,), ("",)), PANDA)
     drawn(figure)
@@ -83,8 +79,7 @@ def test_grippers_beyond_the_image_are_shown_whole_and_a_body_without_grasp_says
     aside = Superquadric(BODY.size, BODY.shape, BODY.translation + np.array([0.25, 0.0, 0.0]), BODY.rotation)
     down = np.array([np.sin(-np.pi / 4), 0, 0, np.cos(np.pi / 4)])  # approaches along the image's y axis
     grasp = Grasp(0, BODY.translation - np.array([0, 0.28, 0]), down, 0.08, 0.06, 0.875, "")
-    figure = plots.new_figure(6.4, 4.8)
-    ax = figure.add_axes((0, 0, 1, 1))
+    figure, ax = one_picture()
     depth = np.full((CAMERA.height, CAMERA.width), 0.8)
     plan = GraspPlan((grasp,), ("", "too wide for the gripper"))
     plots.draw_grasps(ax, depth, CAMERA, [BODY, aside], plan, PANDA, numbers=[0, 3])
@@ -109,8 +104,7 @@ def test_a_view_from_the_camera_s_side_looks_like_the_image():
     red, blue = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 
     def middle(azimuth):
-        figure = plots.new_figure(4, 4)
-        ax = figure.add_axes((0, 0, 1, 1))
+        figure, ax = one_picture((4, 4))
         draw_bodies_3d(ax, [left, right], colours=[red, blue], elevation=0, azimuth=azimuth)
         picture = drawn(figure)
         difference = picture[..., 0] - picture[..., 2]
@@ -138,9 +132,7 @@ def test_figures_of_full_and_empty_frames(tmp_path):
 
 def test_numbers_of_a_body_in_the_cube_are_beside_each_other():
     camera = unit_cube.camera(96)
-    depth, labels = shot(
-        unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5] * 3, BODY.rotation)), camera
-    )
+    depth, labels = shot(IN_CUBE, camera)
     found = Recoverer(method="symmetry").recover(depth, camera, labels)
     figure = recovery_figure(depth, camera, found)
     figure.canvas.draw()
@@ -152,17 +144,16 @@ def test_numbers_of_a_body_in_the_cube_are_beside_each_other():
 
 
 def test_draw_on_a_plane_with_points_and_true_wires():
-    figure = plots.new_figure(4, 4)
-    ax = figure.add_axes((0, 0, 1, 1))
+    figure, ax = one_picture((4, 4))
     depth, labels = shot()
     v, u = np.nonzero(labels)
     draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=list(outline(BODY)))
     assert drawn(figure).std() > 20
-    empty = plots.new_figure(2, 2)
-    draw_bodies_3d(empty.add_axes((0, 0, 1, 1)), [])
+    empty, ax = one_picture((2, 2))
+    draw_bodies_3d(ax, [])
     assert drawn(empty).min() == 255
 
 
 def test_pyplot_is_not_imported():
     code = "import sys, sq_perception.evaluation.plots; assert 'matplotlib.pyplot' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    run_python("-c", code)

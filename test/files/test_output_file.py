@@ -1,7 +1,5 @@
 """Results never destroy: what was there stays until something better is whole, and streams are written through."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -35,12 +33,9 @@ def test_an_old_file_stays_until_the_new_one_is_whole(tmp_path, old):
     assert old.read_bytes() == NEW
     assert old.stat().st_mode & 0o777 == 0o640
     assert names(tmp_path) == ["out.json"]
-
-
-def test_a_new_file_has_the_mode_of_any_other(tmp_path):
     (tmp_path / "other").touch()
     output_file.write(tmp_path / "new", NEW)
-    assert (tmp_path / "new").stat().st_mode == (tmp_path / "other").stat().st_mode
+    assert (tmp_path / "new").stat().st_mode == (tmp_path / "other").stat().st_mode, "a new one's is that of any other"
 
 
 @pytest.mark.parametrize("reason", [KeyboardInterrupt, ValueError])
@@ -104,12 +99,10 @@ def test_an_open_descriptor_keeps_what_was_written_to_it(tmp_path):
     assert names(tmp_path) == ["log"]
 
 
-def test_a_full_device_is_an_error(tmp_path):
+def test_the_error_of_a_full_disk_or_device_names_the_file(old, file_size_limit):
     with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
         output_file.write("/dev/full", NEW)
 
-
-def test_the_error_of_a_full_disk_names_the_file(old, file_size_limit):
     def grow():
         with output_file.writing(old) as partial:
             partial.write_bytes(NEW)

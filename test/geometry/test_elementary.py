@@ -1,7 +1,5 @@
 """Logarithms and powers in plain arithmetic, and quantiles, against NumPy and the mathematics library."""
 
-from __future__ import annotations
-
 import numba
 import numpy as np
 import pytest
@@ -16,13 +14,9 @@ def vectorised_log2(x: float) -> float:
 
 
 def test_log2_of_all_magnitudes(rng: np.random.Generator) -> None:
-    x = rng.uniform(1.0, 2.0, 20000) * 2.0 ** rng.integers(-1022, 1023, 20000)
+    powers = 2.0 ** np.arange(-1022, 1024)
+    x = np.concatenate([powers, rng.uniform(1.0, 2.0, 20000) * rng.choice(powers[:-1], 20000)])
     np.testing.assert_allclose(vectorised_log2(x), np.log2(x), rtol=1e-14, atol=3e-14)
-
-
-@pytest.mark.parametrize("k", [-1022, -100, -1, 0, 1, 52, 1023])
-def test_log2_of_powers_of_two(k: int) -> None:
-    assert log2(2.0**k) == pytest.approx(k, rel=1e-15, abs=3e-14)
 
 
 def test_log2_grows(rng: np.random.Generator) -> None:
@@ -31,24 +25,16 @@ def test_log2_grows(rng: np.random.Generator) -> None:
     assert (np.diff(vectorised_log2(x)) > 0).all()
 
 
-@pytest.mark.parametrize("m", [1.0, 1.2, np.sqrt(2.0), 1.9, 2.0])
-def test_log2_of_one_to_two(m: float) -> None:
-    assert log2_from_1_to_2(m) == pytest.approx(np.log2(m), abs=3e-14)
-
-
-@pytest.mark.parametrize("x", [-1022.0, -115.3, -1.5, -0.5, 0.0, 0.5, 1.0, 33.25, 1023.0])
-def test_exp2(x: float) -> None:
-    assert exp2(x) == pytest.approx(2.0**x, rel=1e-13)
-
-
-@pytest.mark.parametrize("r", [-0.5, -0.1, 0.0, 0.3, 0.5])
-def test_exp2_to_half(r: float) -> None:
-    assert exp2_to_half(r) == pytest.approx(2.0**r, rel=1e-14)
-
-
-def test_each_undoes_the_other(rng: np.random.Generator) -> None:
-    for x in rng.uniform(-300, 300, 200):
-        assert log2(exp2(x)) == pytest.approx(x, abs=1e-11)
+@pytest.mark.parametrize(
+    ("function", "known", "numbers"),
+    [
+        (log2_from_1_to_2, np.log2, [1.0, 1.2, np.sqrt(2.0), 1.9, 2.0]),
+        (exp2, np.exp2, [-1022.0, -115.3, -1.5, -0.5, 0.0, 0.5, 1.0, 33.25, 1023.0]),
+        (exp2_to_half, np.exp2, [-0.5, -0.1, 0.0, 0.3, 0.5]),
+    ],
+)
+def test_logarithms_and_powers_are_those_of_numpy(function, known, numbers) -> None:
+    np.testing.assert_allclose([function(x) for x in numbers], known(numbers), rtol=1e-13, atol=3e-14)
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 100])

@@ -1,7 +1,5 @@
 """Quaternions x y z w: agreement with SciPy, inverses, gradients."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

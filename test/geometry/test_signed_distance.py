@@ -1,7 +1,5 @@
 """Signed distances: closed forms, that they are lower bounds, gradients, unions and doubts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

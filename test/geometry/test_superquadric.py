@@ -1,15 +1,12 @@
 """The superquadric: closed forms against each other, against sampling, and NumPy against torch and numba."""
 
-from __future__ import annotations
-
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from python_process import run_python
 
 from sq_perception.geometry import Superquadric, kernels, rotation
 
@@ -18,12 +15,8 @@ IDENTITY = np.array([0.0, 0, 0, 1])
 
 def random_bodies(count: int, seed: int, e_low: float = 0.1, e_high: float = 1.9) -> Superquadric:
     rng = np.random.default_rng(seed)
-    return Superquadric(
-        rng.uniform(0.02, 0.4, (count, 3)),
-        rng.uniform(e_low, e_high, (count, 2)),
-        rng.uniform(-1, 1, (count, 3)),
-        rotation.random(count, rng),
-    )
+    size, shape = rng.uniform(0.02, 0.4, (count, 3)), rng.uniform(e_low, e_high, (count, 2))
+    return Superquadric(size, shape, rng.uniform(-1, 1, (count, 3)), rotation.random(count, rng))
 
 
 def local(size: list[float], shape: list[float]) -> Superquadric:
@@ -66,12 +59,6 @@ class TestSurface:
         bodies = random_bodies(20, 2, e_low, e_high)
         rng = np.random.default_rng(3)
         points = bodies.parametric_points(rng.uniform(-np.pi / 2, np.pi / 2, 100), rng.uniform(-np.pi, np.pi, 100))
-        np.testing.assert_allclose(bodies.gauge(points), 1, atol=1e-9)
-
-    def test_samples_lie_on_the_surface(self) -> None:
-        bodies = random_bodies(6, 4)
-        points = bodies.sample_surface(300, np.random.default_rng(5))
-        assert points.shape == (6, 300, 3)
         np.testing.assert_allclose(bodies.gauge(points), 1, atol=1e-9)
 
     def test_samples_are_uniform_in_area(self) -> None:
@@ -205,28 +192,6 @@ class TestTorch:
 
 
 class TestKernels:
-    """The compiled copies say what the array statement says."""
-
-    def test_gauge_and_derivatives(self) -> None:
-        bodies = random_bodies(50, 26, 0.1, 1.9)
-        rng = np.random.default_rng(27)
-        for body in bodies:
-            for p in rng.uniform(-0.6, 0.6, (5, 3)) * rng.choice([0.0, 1.0, 1.0], (5, 3)):
-                if not p.any():
-                    continue
-                flat = torch.tensor([*body.size, *body.shape, 0, 0, 0, *IDENTITY], requires_grad=True)
-                point = torch.tensor(p[None], requires_grad=True)
-                g = Superquadric.from_flat(flat).gauge(point)[0]
-                g.backward()
-                compiled = kernels.gauge_derivatives(*p, *body.size, *body.shape, 0.0, 0.0)[:6]
-                by_size = -p * np.array(compiled[1:4]) / body.size
-                assert compiled[0] == pytest.approx(g.item(), rel=1e-9)
-                assert kernels.gauge(*p, *body.size, *body.shape, 0.0, 0.0) == pytest.approx(g.item(), rel=1e-9)
-                nonzero = p != 0
-                np.testing.assert_allclose(np.array(compiled[1:4])[nonzero], point.grad[0].numpy()[nonzero], rtol=1e-7)
-                np.testing.assert_allclose(compiled[4:], flat.grad[3:5].numpy(), rtol=1e-6, atol=1e-9)
-                np.testing.assert_allclose(by_size, flat.grad[:3].numpy(), rtol=1e-7, atol=1e-9)
-
     def test_rays_meet_the_surface(self) -> None:
         rng = np.random.default_rng(28)
         hits = 0
@@ -275,22 +240,17 @@ class TestMisuse:
 
     @pytest.mark.parametrize("index", [0, slice(None, None, -1), None])
     def test_a_single_body_has_no_parts(self, index: object) -> None:
-        body = Superquadric([1, 2, 3], [1, 1], [0, 0, 0], IDENTITY)
         with pytest.raises(TypeError, match="a single Superquadric"):
-            body[index]
+            local([1, 2, 3], [1, 1])[index]
 
 
 def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> None:
     """A kernel compiled into another module's function: after an edit of its file alone, the new code must run."""
     package = tmp_path / "sq_perception"
     source = Path(kernels.__file__).parents[1]
-    for name in ("__init__.py", "files", "geometry"):
-        target = package / name
-        if (source / name).is_dir():
-            shutil.copytree(source / name, target, ignore=shutil.ignore_patterns("__pycache__"))
-        else:
-            target.parent.mkdir(exist_ok=True)
-            shutil.copy(source / name, target)
+    for name in ("files", "geometry"):
+        shutil.copytree(source / name, package / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(source / "__init__.py", package)
     program = (
         "import numpy as np; from sq_perception.geometry.metrics import _column;"
         "body = np.array([1.0, 1, 1, 1, 1, 0, 0, 0]);"
@@ -299,10 +259,7 @@ def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> Non
     edited = package / "geometry" / "kernels.py"
     answers = []
     for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120
-        )
-        answers.append(done.stdout.strip())
+        answers.append(run_python("-c", program, cwd=tmp_path).stdout.strip())
         edited.write_text(edited.read_text().replace("return hit, first, -last", "return hit, first, first"))
     assert answers == ["(2, 6)", "(2, 2)"]
 

@@ -2,6 +2,7 @@
 
 import sys
 
+import pytest
 from threadpoolctl import threadpool_info
 
 from sq_perception.geometry.threads import one_blas_thread, short_turns
@@ -11,26 +12,22 @@ def threads_of_blas() -> set[int]:
     return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
 
 
-def test_the_last_block_gives_blas_its_threads_back() -> None:
-    before = threads_of_blas()
-    first, second = one_blas_thread(), one_blas_thread()
+@pytest.mark.parametrize(
+    ("block", "setting", "is_changed"),
+    [
+        (one_blas_thread, threads_of_blas, lambda threads: threads == {1}),
+        (short_turns, sys.getswitchinterval, lambda interval: interval <= 0.001),
+    ],
+)
+def test_the_last_block_gives_the_process_its_setting_back(block, setting, is_changed) -> None:
+    before = setting()
+    first, second = block(), block()
     first.__enter__()
     second.__enter__()
     first.__exit__(None, None, None)
-    assert threads_of_blas() == {1}
+    assert is_changed(setting())
     second.__exit__(None, None, None)
-    assert threads_of_blas() == before
-
-
-def test_the_last_block_gives_python_its_turns_back() -> None:
-    before = sys.getswitchinterval()
-    first, second = short_turns(), short_turns()
-    first.__enter__()
-    second.__enter__()
-    first.__exit__(None, None, None)
-    assert sys.getswitchinterval() <= 0.001
-    second.__exit__(None, None, None)
-    assert sys.getswitchinterval() == before
+    assert setting() == before
 
 
 def test_turns_that_are_shorter_already_stay() -> None:

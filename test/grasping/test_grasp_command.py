@@ -1,7 +1,5 @@
 """sq-perception grasp: what is in its JSON, its pictures and meshes, and wrong usage."""
 
-from __future__ import annotations
-
 import json
 
 import cv2
@@ -9,9 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from sq_perception import Camera, Superquadric
 from sq_perception.commands import grasp_run, main
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing_setting import optical_from_table
 
@@ -34,7 +31,9 @@ def frame(tmp_path):
     return path
 
 
-def test_why_a_frame_has_no_grasps_is_said(tmp_path, capsys):
+def test_why_there_are_no_grasps_is_said(tmp_path, capsys):
+    assert main.main(["grasp", str(tmp_path / "none.npz"), "--json", "-"]) == 1
+    assert "none.npz" in capsys.readouterr().err
     np.savez(tmp_path / "dark.npz", depth=np.full((120, 160), np.nan, np.float32), K=CAMERA.matrix)
     assert main.main(["grasp", str(tmp_path / "dark.npz")]) == 0
     assert "dark.npz: the image holds no depth" in capsys.readouterr().err
@@ -167,8 +166,3 @@ def test_the_frames_of_a_bag_are_told_apart_by_their_stamps(frame, tmp_path, cap
 def test_wrong_usage_is_told(frame, wrong, capsys):
     assert main.main(["grasp", str(frame), *wrong]) == 2
     assert "sq-perception" in capsys.readouterr().err
-
-
-def test_a_frame_that_is_none_is_reported(tmp_path, capsys):
-    assert main.main(["grasp", str(tmp_path / "none.npz"), "--json", "-"]) == 1
-    assert "none.npz" in capsys.readouterr().err

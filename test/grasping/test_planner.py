@@ -1,14 +1,12 @@
 """Grasps whose best is known in closed form; what makes one impossible; and a plan's invariances."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sq_perception import Camera, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import clearance, surroundings
 from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import GRIPPERS, PANDA, Gripper, gripper
@@ -16,7 +14,6 @@ from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import Trials
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
 
 TABLE = np.array([0.0, 0.0, 1.0, 0.0])
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -126,9 +123,8 @@ def test_what_is_wider_than_the_opening_is_never_tried():
 def test_what_lies_behind_the_support_has_that_for_a_reason():
     """Also where it is too wide; what looks out of the plane only in part is in the table's way."""
     sunk = Superquadric(*CAN, [0.5, 0.0, -0.055], UPRIGHT)
-    behind, wide = (
-        Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT), Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT),
-    )
+    behind = Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT)
+    wide = Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT)
     reasons = plan(behind, wide, sunk, standing(*CAN, y=0.5)).reasons
     assert reasons[:2] == ("behind the plane that bodies stand on",) * 2
     assert reasons[2].startswith("no way for the fingers")
@@ -176,9 +172,8 @@ def test_the_hand_stands_farther_from_the_side_that_is_less_sure():
     half, place = 0.5 * (0.001**2 + 0.006**2), 0.5 * (0.001**2 - 0.006**2)
     spread[0][np.ix_([1, 6], [1, 6])] = 0.5 * np.array([[half, place], [place, half]])
     body = standing([0.05, 0.015, 0.06], [0.1, 0.1])
-    found = [
-        grasp for grasp in plan(body, covariance=spread, placement=0.0).grasps if abs(closing_line(grasp)[1]) > 0.99
-    ]
+    planned = plan(body, covariance=spread, placement=0.0).grasps
+    found = [grasp for grasp in planned if abs(closing_line(grasp)[1]) > 0.99]
     assert found
     for grasp in found:
         assert grasp.opening == pytest.approx(0.03 + (0.005 + 2 * 0.001) + (0.005 + 2 * 0.006), abs=2e-4)
@@ -244,9 +239,8 @@ def test_gaps_to_spheres_and_depths_of_points():
     for way, half in ((np.array([1.0, 0, 0]), 0.01), (np.array([0, -1.0, 0]), 0.02), (np.array([0, 0.6, 0.8]), None)):
         corner = np.array([0.0, 0.02, 0.03]) if half is None else half * way
         ball = Superquadric.stack([Superquadric([0.02] * 3, [1.0, 1.0], corner + 0.03 * way, UPRIGHT)])
-        gap, which, found = clearance.gaps_to_bodies(
-            frame, box, np.array([-1]), ball.to_flat(), np.ascontiguousarray(ball.rotation_matrix), np.zeros(1, int)
-        )
+        known = ball.to_flat(), np.ascontiguousarray(ball.rotation_matrix), np.zeros(1, int)
+        gap, which, found = clearance.gaps_to_bodies(frame, box, np.array([-1]), *known)
         assert which[0] == 0
         assert gap[0] == pytest.approx(0.01, abs=1e-4)
         np.testing.assert_allclose(found[0], way, atol=1e-6)
@@ -268,14 +262,10 @@ def test_what_is_known_of_a_body_counts_though_not_all_is():
     for unknown in ([8, 9, 10], [2], range(5, 8)):
         part = vague.copy()
         part[:, unknown] = part[:, :, unknown] = np.nan
-        assert (
-            plan(body, covariance=part).grasps[0].score
-            < plan(body, covariance=np.full_like(vague, np.nan)).grasps[0].score
-        )
-    np.testing.assert_array_equal(
-        KnownBodies.of(Superquadric.stack([body]), np.full((1, 11, 11), np.nan)).covariance,
-        KnownBodies.of(Superquadric.stack([body]), None).covariance,
-    )
+        scores = [plan(body, covariance=each).grasps[0].score for each in (part, np.full_like(vague, np.nan))]
+        assert scores[0] < scores[1]
+    unknown = (KnownBodies.of(Superquadric.stack([body]), each) for each in (np.full((1, 11, 11), np.nan), None))
+    np.testing.assert_array_equal(*(each.covariance for each in unknown))
 
 
 def test_the_score_falls_with_the_friction():
@@ -340,9 +330,8 @@ def test_places_are_hidden_that_the_image_does_not_show_to_be_empty():
     depth[:, :32] = np.nan
     around = Surroundings(depth=depth, camera=CAMERA)
     before, behind, dark, outside = [0.1, 0.0, 0.9], [0.1, 0.0, 1.1], [-0.1, 0.0, 0.9], [0.9, 0.0, 0.9]
-    np.testing.assert_allclose(
-        around.hidden_share(np.array([[before, before], [before, behind], [dark, outside]])), [0, 0.5, 1]
-    )
+    places = np.array([[before, before], [before, behind], [dark, outside]])
+    np.testing.assert_allclose(around.hidden_share(places), [0, 0.5, 1])
     assert Surroundings().hidden_share(np.array([before])) == 1
 
 
@@ -371,21 +360,17 @@ def test_a_plan_moves_with_the_scene():
     normal = quaternions.to_matrix(turn)[:, 2]
     bodies = [standing(*CAN), standing(*BOX, x=0.15)]
     here = plan(*bodies)
-    there = plan(
-        *(body.transformed(turn, shift) for body in bodies),
-        around=Surroundings(plane=np.append(normal, -normal @ shift)),
-        covariance=np.stack([np.diag([1e-6] * 3 + [1e-4] * 2 + [1e-6] * 3 + [1e-4] * 3)] * 2),
-    )
+    around = Surroundings(plane=np.append(normal, -normal @ shift))
+    there = plan(*(body.transformed(turn, shift) for body in bodies), around=around)
     for k in range(2):  # equal ones may come in another order
         assert there.of(k)[0].score == pytest.approx(here.of(k)[0].score, abs=2e-3)
 
 
 def test_hostile_input_gets_an_answer_with_a_reason():
     rng = np.random.default_rng(3)
-    places = np.concatenate([rng.uniform(-1, 1, (200, 2)), np.full((200, 1), 0.05)], axis=1)
-    many = Superquadric(
-        rng.uniform(0.01, 0.2, (200, 3)), rng.uniform(0.1, 1, (200, 2)), places, rng.standard_normal((200, 4))
-    )
+    size, shape = rng.uniform(0.01, 0.2, (200, 3)), rng.uniform(0.1, 1, (200, 2))
+    places = rng.uniform([-1, -1, 0.05], [1, 1, 0.05], (200, 3))
+    many = Superquadric(size, shape, places, rng.standard_normal((200, 4)))
     for around in (None, ON_TABLE):
         found = grasps(many, PANDA, np.full((200, 11, 11), np.nan), around)
         assert len(found.reasons) == 200
@@ -458,10 +443,6 @@ def test_the_first_of_each_body_are_its_most_probable_ones():
     numbers = np.arange(60.0)
     trials = Trials(owner, np.zeros((60, 3, 4)), numbers, numbers, logs, np.zeros((60, 2)))
     total = logs.sum(axis=1)
-    expected = [
-        row
-        for k in range(4)
-        for row in sorted(np.flatnonzero((owner == k) & (total > -45)), key=lambda row: -total[row])[:5]
-    ]
-    np.testing.assert_array_equal(trials.first(5, -45.0).opening, expected)
+    each = (sorted(np.flatnonzero((owner == k) & (total > -45)), key=lambda row: -total[row])[:5] for k in range(4))
+    np.testing.assert_array_equal(trials.first(5, -45.0).opening, np.concatenate([*each]))
     assert not len(trials.at(np.empty(0, int)).first(5).owner)

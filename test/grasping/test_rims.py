@@ -1,16 +1,13 @@
 """An open vessel that is too wide for the gripper, seen from above, is taken by its rim; with a lid it is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from sq_perception import Camera, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import PANDA
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.imaging.camera import Camera
 
 CAMERA = Camera(320, 240, 400.0, 400.0, 159.5, 119.5)
 TABLE = np.array([0.0, 0.0, -1.0, 0.6])

@@ -3,8 +3,6 @@
 The profile is empty, the renderer is software, and no name is resolved.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

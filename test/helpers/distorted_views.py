@@ -3,12 +3,9 @@
 No image is resampled here, so that these are what rectified and distorted images have to agree with.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
+from sq_perception import Camera, Superquadric
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 

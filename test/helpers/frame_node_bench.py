@@ -1,7 +1,5 @@
 """A frame node between real publishers and subscribers, around a recoverer that does what the test says."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -17,13 +15,10 @@ from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_to_message, intrinsics_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.fitting.fit import Fit, Status
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Camera, Fit, FrameRecovery, Recovery, Status, Superquadric
 from sq_perception.imaging.calibration import intrinsics
-from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import engine
 from sq_perception.nodes.frame_node import FrameNode
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 FRAME_ID = "some_camera_optical_frame"

@@ -5,8 +5,6 @@ missing.  Sizes stay below 200 x 200 pixels of data, so that thousands of frames
 has no such limit.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from collections.abc import Sequence
@@ -175,6 +173,7 @@ def broken_images(draw: st.DrawFn, encodings: tuple[str, ...] = _DEPTH) -> Image
 
 IMAGES, MASKS = (st.one_of(_SOUND[encodings], broken_images(encodings)) for encodings in (_DEPTH, _LABELS))
 """Depth images and label images, sound ones and broken ones."""
+
 
 @st.composite
 def hostile_infos(draw: st.DrawFn, width: int, height: int, header: Header) -> CameraInfo:

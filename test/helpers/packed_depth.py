@@ -1,7 +1,5 @@
 """Depth images packed as compressed_depth_image_transport does it."""
 
-from __future__ import annotations
-
 import struct
 
 import cv2

@@ -1,7 +1,5 @@
 """Columns of the cloud of superquadrics, of random content."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sq_msgs_py.superquadrics import SuperquadricArray

@@ -1,17 +1,14 @@
 """Runs of ``sq-perception recover`` on rendered frames of two bodies, with their masks, and on plain images."""
 
-from __future__ import annotations
-
 import json
 
 import cv2
 import numpy as np
 import yaml
 
+from sq_perception import Camera, Superquadric
 from sq_perception.commands import main
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 BODIES = Superquadric(

@@ -5,8 +5,6 @@ The kernels of :mod:`sq_perception.fitting.residuals` are compared with this; sy
 hold fixed in their derivatives are detached here.
 """
 
-from __future__ import annotations
-
 import torch
 
 from sq_perception.geometry import rotation as quaternions

@@ -4,8 +4,6 @@ Nothing here knows the inside of a node: topics, services, diagnostics and /proc
 seconds of the monotonic clock, ages milliseconds from the stamp of an image to the arrival of its result in the peer.
 """
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -24,9 +22,8 @@ from started_nodes import Child
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_to_message, intrinsics_to_message
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Camera, Superquadric
 from sq_perception.imaging.calibration import intrinsics
-from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import process
 from sq_perception.nodes.frame import stamp_of
 from sq_perception.simulation.scenes import Scene

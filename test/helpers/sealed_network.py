@@ -6,8 +6,6 @@ packet is seen, whichever library, thread or child process sends it: a look-up a
 As a program inside such a network, ``sealed_network.py RECORD SECONDS AFTER COMMAND ...`` writes the record as JSON.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import json
 import shutil

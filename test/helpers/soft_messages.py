@@ -6,8 +6,6 @@ the planning scene that nobody here touches (joints, colours, octomaps) are left
 has: a test that calls one skips where the package is not installed.
 """
 
-from __future__ import annotations
-
 import sys
 import types
 from collections.abc import Callable

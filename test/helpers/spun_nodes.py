@@ -1,7 +1,5 @@
 """Nodes in a ROS context of their own, spun in the background, and a peer beside them that speaks to them."""
 
-from __future__ import annotations
-
 import gc
 import threading
 import time

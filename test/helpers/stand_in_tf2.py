@@ -1,7 +1,5 @@
 """A stand-in for tf2_ros, whose transforms the test knows."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from types import SimpleNamespace

@@ -1,15 +1,12 @@
 """Bodies on a table, seen by a camera with noise, and how well segments cover them."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np
 
+from sq_perception import Camera, Superquadric
 from sq_perception.geometry import rotation
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
 from sq_perception.learning import inference
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.segmentation import segments

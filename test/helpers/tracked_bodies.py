@@ -1,16 +1,13 @@
 """Bodies as a tracker sees them: observations drawn from known covariances, cameras about them, errors of tracks."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
 
+from sq_perception import Camera, Superquadric
 from sq_perception.fitting import quality
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
 from sq_perception.tracking import association, state, track, tracker
 

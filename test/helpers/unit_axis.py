@@ -1,7 +1,5 @@
 """Grids of the unit cube: what canonical views and soft images are compared with, and where occupancies are."""
 
-from __future__ import annotations
-
 import torch
 
 from sq_perception.geometry import Superquadric

@@ -1,7 +1,5 @@
 """Which pieces of a mask are of the object: steps in depth part it from what is before and behind it, or within it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Packed depth images: there and back, RVL against a packer written from the paper, and what is hostile."""
 
-from __future__ import annotations
-
 import struct
 import tracemalloc
 

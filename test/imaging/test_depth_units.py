@@ -1,12 +1,12 @@
-"""Numbers of depth images to metres: what is a unit, what is no reading, and what stays what it is."""
-
-from __future__ import annotations
+"""Numbers of depth images to metres: what is a unit, what is no reading, and what seems to be ranges instead of z."""
 
 import numpy as np
 import pytest
+from table_scenes import Table, noisy
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.depth_units import UnitsError, metres, parse_scale, wrong_unit, z_from_range
+from sq_perception.imaging.ranges import seem_ranges
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 
@@ -91,12 +91,9 @@ def test_raw_disparities_of_a_kinect_are_refused(table):
 )
 def test_conventions_of_a_stated_unit_are_told_apart_by_magnitude(value, scale):
     assert parse_scale(value, "depth_scale").scale == pytest.approx(scale)
-
-
-@pytest.mark.parametrize("value", [0.0, -0.1, np.inf, np.nan])
-def test_a_unit_that_is_none_is_refused(value):
-    with pytest.raises(ValueError, match="positive number"):
-        parse_scale(value, "depth_scale")
+    for none in (0.0, -value, np.inf, np.nan):
+        with pytest.raises(ValueError, match="positive number"):
+            parse_scale(none, "depth_scale")
 
 
 def test_a_stated_unit_is_of_whole_numbers_and_the_callers_goes_before(table):
@@ -120,3 +117,47 @@ def test_ranges_become_z_along_the_axis(rng):
     points = CAMERA.points(rng.uniform(0.5, 2.0, (120, 160)).astype(np.float32))
     z = z_from_range(np.linalg.norm(points, axis=2).astype(np.float32), CAMERA)
     np.testing.assert_allclose(z, points[..., 2], rtol=1e-6)
+
+
+def camera(degrees):
+    focal = 160 / np.tan(np.radians(degrees / 2))
+    return Camera(320, 240, focal, focal, 159.5, 119.5)
+
+
+def seen(table, view, sag=0.0):
+    """z of a table that is ``sag`` of a metre lower half a metre from its middle, with a box and a can on it."""
+    bodies = [table.body(-0.1, 0.05, (0.05, 0.03, 0.08)), table.body(0.12, 0, (0.033, 0.033, 0.06), (0.1, 1.0))]
+    depth, labels = table.see(bodies, camera=view)
+    rays = view.rays(*np.meshgrid(np.arange(view.width), np.arange(view.height)))[1]
+    z = depth
+    for _ in range(8):  # the height at a point depends on the point
+        x, y = np.moveaxis((rays * z[..., None] - table.origin) @ table.axes[:, :2], -1, 0)
+        height = np.clip(-4 * sag * (x**2 + y**2), -0.1, 0.1)
+        z = np.where(labels > 0, depth, (height - table.plane[3]) / (rays @ table.plane[:3]))
+    return np.where((z > 0) & (z < 6), z, np.nan), np.linalg.norm(rays, axis=2)
+
+
+@pytest.mark.parametrize("degrees", [55, 85])
+@pytest.mark.parametrize("pitch", [0.4, 0.75, 1.5])
+@pytest.mark.parametrize("noise", [0.0, 0.002])
+def test_ranges_are_noticed_and_depths_are_not(degrees, pitch, noise):
+    view = camera(degrees)
+    z, length = seen(Table(pitch), view)
+    assert seem_ranges(noisy(z * length, noise), view)
+    assert not seem_ranges(noisy(z, noise), view)
+
+
+@pytest.mark.parametrize("degrees", [55, 85])
+@pytest.mark.parametrize("sag", [-0.02, -0.01, 0.01, 0.02])
+def test_a_table_that_bends_is_none_of_ranges(degrees, sag):
+    view = camera(degrees)
+    for pitch in (0.4, 0.75, 1.5):
+        assert not seem_ranges(noisy(seen(Table(pitch), view, sag)[0], 0.002), view)
+
+
+def test_what_shows_no_plane_says_nothing(rng):
+    view = camera(85)
+    assert not seem_ranges(rng.uniform(0.5, 2.0, (240, 320)), view)
+    assert not seem_ranges(np.full((240, 320), np.nan), view)
+    assert not seem_ranges(np.ones((240, 320)), view), "a wall"
+    assert not seem_ranges(np.ones((2, 2)), Camera(2, 2, 2.0, 2.0, 0.5, 0.5))

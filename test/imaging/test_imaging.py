@@ -1,16 +1,14 @@
 """Cameras, ray casting, the unit cube, canonical views and soft rendering."""
 
-from __future__ import annotations
-
 import os
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from python_process import run_python
 from unit_axis import cell_centres, soft_images
 
 from sq_perception.geometry import Superquadric, rotation
@@ -25,12 +23,9 @@ VGA = Camera(640, 480, 520.0, 530.0, 322.5, 238.0)
 def tabletop_bodies(count: int, seed: int) -> Superquadric:
     """Bodies in front of a pinhole camera, some of them partly outside of the image."""
     rng = np.random.default_rng(seed)
-    return Superquadric(
-        rng.uniform(0.03, 0.15, (count, 3)),
-        rng.uniform(0.1, 1.5, (count, 2)),
-        np.stack([rng.uniform(-0.5, 0.5, count), rng.uniform(-0.4, 0.4, count), rng.uniform(0.5, 1.5, count)], axis=1),
-        rotation.random(count, rng),
-    )
+    size, shape = rng.uniform(0.03, 0.15, (count, 3)), rng.uniform(0.1, 1.5, (count, 2))
+    places = rng.uniform([-0.5, -0.4, 0.5], [0.5, 0.4, 1.5], (count, 3))
+    return Superquadric(size, shape, places, rotation.random(count, rng))
 
 
 def author_renders(shared_data: Path) -> list[tuple[np.ndarray, Superquadric]]:
@@ -76,24 +71,20 @@ class TestCamera:
         np.testing.assert_allclose(points[:, 2], depth)
         np.testing.assert_allclose(camera.project(points), np.stack([u, v], axis=1), atol=1e-9)
 
-    def test_pixel_centres_are_integers(self) -> None:
+    def test_pixel_centres_are_integers_and_points_behind_a_pinhole_have_none(self) -> None:
         np.testing.assert_allclose(VGA.unproject(322.5, 238.0, 2.0), [0, 0, 2])
+        assert np.isnan(VGA.project(np.array([0.1, 0.1, -1.0]))).all()
 
     def test_cropping_keeps_the_rays(self) -> None:
         crop = VGA.cropped(100, 50, 30, 20)
         np.testing.assert_allclose(crop.unproject(3, 4, 1.0), VGA.unproject(103, 54, 1.0))
 
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            *(({"fx": 0.0}, "focal"), ({"fy": -3.0}, "focal"), ({"cx": np.nan}, "finite"), ({"width": 0}, "1 x 1")),
-            ({"width": 4.0}, "whole numbers"),
-        ],
-    )
-    def test_refuses_what_is_no_camera(self, change: dict[str, float], message: str) -> None:
-        good = {"width": 4, "height": 4, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 2.0}
-        with pytest.raises(ValueError, match=message):
-            Camera(**{**good, **change})
+    def test_refuses_what_is_no_camera(self) -> None:
+        wrong = {"fx": 0.0, "fy": -3.0, "cx": np.nan, "width": 0, "height": 4.0}
+        words = ("focal", "focal", "finite", "1 x 1", "whole numbers")
+        for (name, value), said in zip(wrong.items(), words, strict=True):
+            with pytest.raises(ValueError, match=said):
+                replace(VGA, **{name: value})
 
     def test_a_matrix_is_read_by_rows_and_refused_where_it_is_transposed(self) -> None:
         assert Camera.from_matrix(VGA.matrix, 640, 480) == VGA
@@ -111,16 +102,12 @@ class TestCamera:
             with pytest.raises(ValueError, match=r"depth: expected a float image \(height, width\) in metres, got"):
                 VGA.readings(image)
 
-    def test_points_behind_a_pinhole_have_no_pixel(self) -> None:
-        assert np.isnan(VGA.project(np.array([0.1, 0.1, -1.0]))).all()
-
 
 class TestRaycast:
     @pytest.mark.parametrize(("code", "threads"), [(FORKED, "default"), (THREADED, "workqueue")])
     def test_forked_processes_and_threads_render_alike(self, code: str, threads: str) -> None:
         """GNU's OpenMP ends a forked process that calls it, numba's own threads one that calls them twice at a time."""
-        known = {**os.environ, "NUMBA_THREADING_LAYER": threads}
-        subprocess.run([sys.executable, "-c", RENDERING + code], env=known, check=True, timeout=300)
+        run_python("-c", RENDERING + code, env={**os.environ, "NUMBA_THREADING_LAYER": threads})
 
     def test_rendered_depth_lies_on_the_surface(self) -> None:
         bodies = tabletop_bodies(30, 1)
@@ -156,11 +143,8 @@ class TestRaycast:
         assert (np.isfinite(depth) == np.isfinite(expected))[sure].all()
         hit = sure & np.isfinite(expected)
         np.testing.assert_allclose(depth[hit], expected[hit], atol=1e-8)
-
-    def test_body_behind_the_camera_is_not_seen(self) -> None:
-        body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0, 0, -1.0]), np.array([0, 0, 0, 1.0]))
-        depth, index = raycast.render(body, VGA)
-        assert np.isinf(depth).all()
+        behind, index = raycast.render(Superquadric([0.1] * 3, [1, 1], [0, 0, -1.0], [0, 0, 0, 1]), VGA)
+        assert np.isinf(behind).all()
         assert (index == -1).all()
 
     def test_reproduces_the_authors_renders(self, shared_data: Path) -> None:
@@ -171,9 +155,7 @@ class TestRaycast:
             assert (grey == image).mean() >= 0.9995
             both = (grey > 0) & (image > 0)
             assert np.abs(grey[both].astype(int) - image[both]).max() <= 1
-            edge = cv2.dilate((image > 0).astype(np.uint8), np.ones((3, 3))) - cv2.erode(
-                (image > 0).astype(np.uint8), np.ones((3, 3))
-            )
+            edge = cv2.morphologyEx((image > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((3, 3)))
             assert ((grey > 0) != (image > 0))[edge == 0].sum() == 0
 
 
@@ -216,10 +198,8 @@ class TestCanonicalView:
         bodies = thesis_bodies(20, rng)
         camera = unit_cube.camera()
         if projection == "pinhole":
-            bodies = Superquadric(
-                bodies.size, bodies.shape, rng.uniform(-0.3, 0.3, (20, 3)) + [0, 0, 2], bodies.rotation
-            )
-            camera = VGA
+            places, camera = rng.uniform(-0.3, 0.3, (20, 3)) + [0, 0, 2], VGA
+            bodies = Superquadric(bodies.size, bodies.shape, places, bodies.rotation)
         else:
             bodies = unit_cube.optical_from_cube(bodies)
         for body in bodies:
@@ -285,9 +265,8 @@ class TestCanonicalView:
         rolled = body.transformed(roll, np.zeros(3)), np.append(rotation.to_matrix(roll) @ plane[:3], plane[3])
         view, same = seen(body, plane), seen(*rolled)
         np.testing.assert_allclose(same.plane_to_canonical(rolled[1]), view.plane_to_canonical(plane), atol=0.02)
-        np.testing.assert_allclose(
-            same.to_canonical(rolled[0]).to_flat()[:8], view.to_canonical(body).to_flat()[:8], atol=0.02
-        )
+        bodies = same.to_canonical(rolled[0]), view.to_canonical(body)
+        np.testing.assert_allclose(*(each.to_flat()[:8] for each in bodies), atol=0.02)
         assert (view.hidden != same.hidden).mean() < 0.04
         both = (view.image > 0) & (same.image > 0)
         assert np.abs(view.image - same.image)[both].mean() < 0.01
@@ -323,8 +302,7 @@ class TestCanonicalView:
         # Who drew a mask over pixels without a reading knows where the thing ends.
         depth[40:50, 40:50] = np.nan
         drawn = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
-        assert drawn.with_steps[i[0], i[0]] == covered
-        assert drawn.with_steps[i[3], j] == 0
+        assert (drawn.with_steps[i[0], i[0]], drawn.with_steps[i[3], j]) == (covered, 0)
         np.testing.assert_array_equal(drawn.with_steps[i[:3], j], view.with_steps[i[:3], j])
 
     def test_the_table_is_no_step(self) -> None:
@@ -363,12 +341,6 @@ class TestSoftRender:
             depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(64))
             exact = np.where(np.isfinite(depth), 1 - depth, 0)
             assert np.abs(image - exact).mean() < 0.0056
-
-    def test_gradcheck(self) -> None:
-        bodies = thesis_bodies(2, np.random.default_rng(9))
-        axis = cell_centres(6)
-        flat = torch.tensor(bodies.to_flat(), requires_grad=True)
-        assert torch.autograd.gradcheck(lambda f: soft_images(Superquadric.from_flat(f), axis, 8.0, 1.5), flat)
 
     @pytest.mark.parametrize(("s", "tau"), [(soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU), (8.0, 0.5)])
     def test_the_compiled_agreement_is_that_of_the_soft_image(self, s: float, tau: float) -> None:

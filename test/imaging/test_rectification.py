@@ -1,18 +1,14 @@
 """Rectified images against images ray-cast through the same lens, and bodies recovered from them."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
 from distorted_views import BARREL, FISHEYE, LENSES, RAW, WIDE, body_depth, plane_depth, rays, share_seen, sphere_depth
 
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Camera, Recoverer, Superquadric
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification, rectification
-from sq_perception.recovery.recoverer import Recoverer
 
 BODY = Superquadric([0.07, 0.05, 0.09], [0.3, 0.6], [0.16, 0.10, 0.75], [0.35, 0.25, 0.15, 0.85])
 
@@ -127,16 +123,12 @@ def test_labels_go_with_their_pixels(rng):
     np.testing.assert_array_equal(undone.there.labels(labels > 0), found > 0)
 
 
-def test_what_is_nothing_stays_nothing():
+def test_holes_keep_their_size_and_nothing_stays_nothing(rng):
+    """A tenth of the pixels measured nothing: about as many are empty afterwards, and what is filled is exact."""
     undone = Rectification(RAW, BARREL)
     assert np.isnan(undone.there.depth(np.full((480, 640), np.nan))).all()
     nothing = undone.back.depth(np.full((undone.camera.height, undone.camera.width), np.inf))
     assert not np.isfinite(nothing).any()
-
-
-def test_holes_keep_their_size(rng):
-    """A tenth of the pixels measured nothing: about as many are empty afterwards, and what is filled is exact."""
-    undone = Rectification(RAW, BARREL)
     normal, distance = tilted(40)
     depth = plane_depth(rays(RAW, BARREL), normal, distance)
     depth[rng.random(depth.shape) < 0.1] = np.nan

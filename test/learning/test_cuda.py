@@ -1,7 +1,5 @@
 """On a graphics card networks predict and train as on the processor; skipped where there is none."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

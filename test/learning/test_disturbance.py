@@ -1,13 +1,10 @@
 """Disturbed views: what an occluder, noise and a wrong mask may change, and what must stay true."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from sq_perception.geometry import Superquadric
+from sq_perception import Camera, Superquadric
 from sq_perception.imaging import canonical_view, raycast, regions
-from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.learning.dataset import Disturbance, ViewPool, ViewSource, any_occluder, draw_views, wide_bodies
 from sq_perception.simulation import view_rendering
@@ -71,12 +68,8 @@ class TestHiddenPixels:
     """Of images: the pixels of the body's own silhouette that another body covers, and no free ones."""
 
     def test_marks_where_the_body_goes_on_and_no_background(self) -> None:
-        behind = Superquadric(
-            np.array([0.06, 0.05, 0.05]), np.array([0.3, 0.8]), np.array([0, 0, 0.8]), np.array([0.2, 0.3, 0.1, 0.9])
-        )
-        before = Superquadric(
-            np.array([0.03, 0.08, 0.02]), np.array([0.1, 0.1]), np.array([0.05, 0, 0.65]), np.eye(4)[3]
-        )
+        behind = Superquadric([0.06, 0.05, 0.05], [0.3, 0.8], [0, 0, 0.8], [0.2, 0.3, 0.1, 0.9])
+        before = Superquadric([0.03, 0.08, 0.02], [0.1, 0.1], [0.05, 0, 0.65], [0, 0, 0, 1])
         depth, index = raycast.render(Superquadric.stack([behind, before]), VGA)
         wall = np.where(np.isfinite(depth), depth, 2.0)
         view = canonical_view.from_mask(wall, index == 0, VGA, find_hidden=True)
@@ -103,7 +96,7 @@ class TestHiddenPixels:
         assert known.hidden.mean() < 0.005
 
     def test_holes_count_and_the_empty_surroundings_do_not(self) -> None:
-        body = Superquadric(np.full(3, 0.05), np.full(2, 0.2), np.array([0, 0, 0.8]), np.array([0.2, 0.3, 0.1, 0.9]))
+        body = Superquadric([0.05] * 3, [0.2] * 2, [0, 0, 0.8], [0.2, 0.3, 0.1, 0.9])
         depth, index = raycast.render(body, VGA)
         depth = np.where(index >= 0, depth, np.nan)
         rows, columns = np.nonzero(index >= 0)
@@ -154,8 +147,7 @@ def test_wide_bodies_have_the_proportions_they_say() -> None:
     ratio = bodies.size.max(axis=1) / bodies.size.min(axis=1)
     assert ratio.max() < 6
     assert (ratio > 3).mean() > 0.3
-    assert bodies.shape.min() >= 0.1
-    assert bodies.shape.max() <= 1.0
+    assert 0.1 <= bodies.shape.min() <= bodies.shape.max() <= 1.0
 
 
 def view_points(view: canonical_view.CanonicalView) -> np.ndarray:
@@ -163,8 +155,6 @@ def view_points(view: canonical_view.CanonicalView) -> np.ndarray:
     n = view.image.shape[0]
     filled = view.image.ravel()[regions.nearest(view.image > 0)]
     x, y = np.meshgrid((np.arange(n) + 0.5) / n, 1 - (np.arange(n) + 0.5) / n)
-    points = np.stack([x, y, filled], axis=-1)
-    dots = Superquadric(
-        np.full((n, n, 3), 0.01), np.ones((n, n, 2)), points, np.broadcast_to(np.array([0.0, 0, 0, 1]), (n, n, 4))
-    )
+    places, ones = np.stack([x, y, filled], axis=-1), np.ones((n, n, 1))
+    dots = Superquadric(0.01 * np.repeat(ones, 3, axis=2), ones * [1.0, 1.0], places, ones * [0.0, 0.0, 0.0, 1.0])
     return view.from_canonical(dots).translation

@@ -1,7 +1,5 @@
 """The network of masks: its loss in closed form, mirrors, a short training, and what the shipped one finds."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

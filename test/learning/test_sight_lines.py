@@ -1,7 +1,5 @@
 """Lines of sight: nearest approach, free space, and soft depth as the limit of the thesis' voxels."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -36,8 +34,7 @@ def test_gradients_are_finite_on_axes(shape: float, sharpness: float | None) -> 
     image.sum().backward()
     assert torch.isfinite(flat.grad).all()
     assert torch.isfinite(image).all()
-    assert (image >= 0).all()
-    assert (image <= 1).all()
+    assert 0 <= image.min() <= image.max() <= 1
 
 
 class TestLines:
@@ -91,13 +88,6 @@ class TestFreeSpace:
         found = soft_render.free_space_excess(SPHERE, line, torch.tensor([[end]], dtype=torch.float64))
         assert found.item() == pytest.approx(excess, abs=1e-3)
 
-    def test_gradcheck(self) -> None:
-        images, bodies = views(2, 2)
-        lines, depth = soft_render.of_view(images, 8)
-        assert torch.autograd.gradcheck(
-            lambda flat: soft_render.free_space_excess(Superquadric.from_flat(flat), lines, depth),
-            (bodies.to_flat() + 0.05).requires_grad_(),
-        )
 
 class TestSoftDepth:
     @pytest.mark.parametrize(("s", "density"), [(10.0, 20.0), (40.0, 100.0), (117.3, 308.5)])
@@ -134,10 +124,8 @@ class TestSoftDepth:
         errors = [(soft_render.soft_depth(bodies, lines, s, 2 * s) - depth).abs().mean() for s in (25, 100, 400)]
         assert errors[0] > 3 * errors[1] > 9 * errors[2]
         assert errors[2] < 0.003
-
-    def test_nothing_seen_is_zero(self) -> None:
         away = torch.tensor([[0.05, 0.95]], dtype=torch.float64)
-        assert soft_render.soft_depth(SPHERE, away, 100.0, 200.0).item() == pytest.approx(0, abs=1e-9)
+        assert soft_render.soft_depth(SPHERE, away, 100.0, 200.0).item() == pytest.approx(0, abs=1e-9), "nothing seen"
 
     @pytest.mark.parametrize(("s", "density", "cells"), [(0.0, 1.0, 8), (1.0, -1.0, 8), (1.0, 1.0, 0)])
     def test_refuses_nonsense(self, s: float, density: float, cells: int) -> None:

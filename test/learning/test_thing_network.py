@@ -1,7 +1,5 @@
 """The network of things: its likelihood in closed form, mirrors, what it begins with, and a short training."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -35,13 +33,9 @@ def shards(folder: Path, count: int, rng: np.random.Generator) -> None:
     """Shards of 24 random views whose numbers have the right form."""
     folder.mkdir()
     for k in range(count):
-        arrays = {
-            "images": rng.random((24, 64, 64)).astype(np.float16),
-            "planes": rng.standard_normal((24, 4)).astype(np.float32),
-            "extents": rng.uniform(0.05, 0.4, 24).astype(np.float32),
-            "support": rng.uniform(0.2, 0.8, (24, J)).astype(np.float32),
-            "kinds": rng.integers(3, size=24),
-        }
+        arrays = {"planes": rng.standard_normal((24, 4)), "extents": rng.uniform(0.05, 0.4, 24)}
+        arrays = {name: one.astype(np.float32) for name, one in (arrays | {"support": rng.random((24, J))}).items()}
+        arrays |= {"images": rng.random((24, 64, 64)).astype(np.float16), "kinds": rng.integers(3, size=24)}
         save_file(arrays, str(folder / f"{k:05d}.safetensors"))
 
 

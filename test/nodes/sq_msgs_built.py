@@ -1,7 +1,5 @@
 """What nodes and their peers do with sq_msgs; run by test_sq_msgs.py, in an environment where it is built."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The programs are in a prefix that the test makes.  Most note their command line 
 one.  launch is in no wheel: it comes with a ROS installation.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -80,14 +78,9 @@ class Launch:
 
     def start(self, *arguments: str) -> None:
         known = os.environ.get("AMENT_PREFIX_PATH", sys.prefix)
-        environment = {
-            **os.environ,
-            "AMENT_PREFIX_PATH": f"{self.prefix}:{known}",
-            "PYTHONPATH": f"{self._repository}:{os.environ.get('PYTHONPATH', '')}",
-            "PYTHONUNBUFFERED": "1",
-            "ROS_LOG_DIR": str(self._folder / "log"),
-        }
-        environment.pop(process.PROFILE, None)
+        environment = {name: value for name, value in os.environ.items() if name != process.PROFILE}
+        environment |= {"PYTHONPATH": f"{self._repository}:{os.environ.get('PYTHONPATH', '')}", "PYTHONUNBUFFERED": "1"}
+        environment |= {"AMENT_PREFIX_PATH": f"{self.prefix}:{known}", "ROS_LOG_DIR": str(self._folder / "log")}
         path = str(self._repository / "launch_scripts" / "recover.launch.py")
         self._process = subprocess.Popen(
             [sys.executable, "-c", SERVICE, path, *arguments], cwd=self._folder, env=environment,
@@ -167,16 +160,14 @@ def test_recover_is_wired_to_the_camera(launch: Launch, tmp_path: Path) -> None:
     noted = launch.note("recover_node")
     words = noted["arguments"]
     assert {"__node:=recover_node", "__ns:=/wrist"} <= set(words)
-    assert remapped(words)["depth/image"] == "/camera/depth"
-    assert remapped(words)["depth/camera_info"] == "/camera/info"
+    assert (remapped(words)["depth/image"], remapped(words)["depth/camera_info"]) == ("/camera/depth", "/camera/info")
     assert words[words.index("--log-level") + 1] == "debug"
     assert parameters(words) == [
         str(mine), "model: supervised", "target_frame: map", "autostart: false", "use_sim_time: true",
     ]  # fmt: skip
     assert noted["profile"] == str(process.profile_path())
     assert parameters(launch.note("fitter_node")["arguments"])[-1] == "method: classic"
-    assert launch.end() == 0
-    assert launch.left() == []
+    assert (launch.end(), launch.left()) == (0, [])
 
 
 def test_an_argument_that_is_not_given_overrides_nothing(launch: Launch) -> None:
@@ -227,8 +218,7 @@ def test_what_is_missing_is_said_before_anything_starts(launch: Launch, argument
     launch.start(argument, "grasp:=true")
     assert launch.exit_code() == 1
     assert words in launch.output
-    assert launch.left() == []
-    assert launch.started() == set()
+    assert (launch.left(), launch.started()) == ([], set())
 
 
 def test_the_real_node_starts_and_ends_with_the_launch(launch: Launch) -> None:
@@ -236,7 +226,6 @@ def test_the_real_node_starts_and_ends_with_the_launch(launch: Launch) -> None:
     launch.install("sq_perception", "recover_node", REAL.format(python=sys.executable))
     launch.start("depth:=/camera/depth", "autostart:=false")
     launch.until(lambda: "ros2 lifecycle set /recover_node configure" in launch.output)
-    assert launch.end() == 0
-    assert launch.left() == []
+    assert (launch.end(), launch.left()) == (0, [])
     assert "Traceback" not in launch.output
     assert "process has died" not in launch.output

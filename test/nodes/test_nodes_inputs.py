@@ -1,7 +1,5 @@
 """Images as cameras send them: packed, raw from a lens that distorts, and as points."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

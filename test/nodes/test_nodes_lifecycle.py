@@ -214,18 +214,6 @@ class TestLifecycle:
             assert bench.state() == "active"
         assert bench.answer() == 1.0
 
-    def test_services_answer_while_the_model_loads(self, make_bench):
-        bench = make_bench("-p", "autostart:=false")
-        bench.gate.clear()
-        request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-        future = bench.ask(ChangeState, "/recover_node/change_state", request)
-        bench.until(lambda: bench.node.state == "configuring")
-        assert bench.state() == "configuring"
-        assert not future.done()
-        bench.gate.set()
-        bench.until(future.done)
-        assert future.result().success
-
     def test_a_configuration_that_fails_goes_through_the_error_state_and_says_why(self, make_bench):
         bench = make_bench("-p", "autostart:=false")
         bench.until(lambda: bench.peer.count_publishers("/recover_node/transition_event") == 1)
@@ -237,16 +225,12 @@ class TestLifecycle:
         assert bench.events == ["configuring", "errorprocessing", "unconfigured"]
         reason = "cannot configure: weights.safetensors: no such model file"
         bench.report(lambda one: one.level == DiagnosticStatus.ERROR and one.message == f"unconfigured: {reason}")
+        bench.node.start()
+        bench.until(lambda: bench.node.start_failure)
+        assert bench.node.start_failure == reason, "as the process is told"
         bench.fault = None
         assert bench.bring_up().answer() == 1.0
         bench.report(lambda one: one.level == DiagnosticStatus.OK)
-
-    def test_an_autostart_that_fails_is_told_to_the_process(self, make_bench):
-        bench = make_bench("-p", "autostart:=false")
-        bench.fault = ValueError("no such file")
-        bench.node.start()
-        bench.until(lambda: bench.node.start_failure)
-        assert bench.node.start_failure == "cannot configure: no such file"
 
     def test_a_device_that_fails_frame_after_frame_is_started_anew(self, make_bench, monkeypatch):
         monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
@@ -321,12 +305,14 @@ class TestSwap:
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
 
-    def test_a_model_that_is_set_while_another_one_is_loaded_follows_it(self, make_bench):
+    def test_services_answer_while_a_model_loads_and_another_one_that_is_set_then_follows_it(self, make_bench):
         bench = make_bench("-p", "autostart:=false")
         bench.gate.clear()
         bench.node.start()
         bench.until(lambda: bench.node.state == "configuring")
+        assert bench.state() == "configuring"
         bench.set(bench.node, model="6")
+        assert not bench.made
         bench.gate.set()
         assert bench.active().answer() == 6.0
 

@@ -156,13 +156,8 @@ def test_a_model_file_that_changes_under_a_node_changes_nothing(peer, recover_no
     alive, name = (recover_node,), "/recover_node"
     known = from_message(peer.ask(name, *peer.frame(), alive=alive).message)
     content = model.read_bytes()
-    for changed in (
-        checkpoint.shipped_weights()["supervised"].read_bytes(),
-        content[: len(content) // 2],
-        np.random.default_rng(0).bytes(len(content)),
-        b"",
-        None,
-    ):
+    other, noise = checkpoint.shipped_weights()["supervised"].read_bytes(), np.random.default_rng(0).bytes(len(content))
+    for changed in (other, content[: len(content) // 2], noise, b"", None):
         if changed is None:
             model.unlink()
         else:
@@ -170,6 +165,13 @@ def test_a_model_file_that_changes_under_a_node_changes_nothing(peer, recover_no
         found = from_message(peer.ask(name, *peer.frame(), alive=alive).message)
         assert difference(found, known) < 1e-6, changed and changed[:40]
         assert peer.set(name, alive, tau=4.82)[0].successful
+    # Other threads are no other weights, but a recoverer that is made anew reads them, and that of before goes on.
+    assert peer.set(name, alive, threads=2)[0].successful
+    found = from_message(peer.ask(name, *peer.frame(), alive=alive).message)
+    assert difference(found, known) < 1e-6
+    until(lambda: "cannot change to method network" in peer.diagnoses(name)[-1].message, alive)
+    for wanted in ({"model": str(model)}, {"method": "auto"}):
+        assert "no such model file" in peer.set(name, alive, **wanted)[0].reason
     assert peer.diagnoses(name)[-1].count("refused") == 0
 
 

@@ -1,7 +1,5 @@
 """Markers of the frame node: made while somebody listens, and gone with what they show."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """What a frame node publishes for other stacks, when, and in which frame."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import fields, replace
@@ -21,12 +19,10 @@ from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
 
 from sq_msgs_py import poses
-from sq_perception.fitting.fit import Status
+from sq_perception import Camera, FrameRecovery, Recovery, Status, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import outputs as outputs_module
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.outputs import OptionalOutputs, in_frame
@@ -34,7 +30,6 @@ from sq_perception.nodes.parameters import ParameterError, RecoverParameters
 from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 HEADER = Header(stamp=Time(sec=10, nanosec=500_000_000), frame_id="camera")
 TF, DETECTIONS, SCENE = "/tf", "~/detections", "~/planning_scene"
@@ -137,9 +132,6 @@ def beside(body: Superquadric, x: float) -> Superquadric:
 def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
     """Operation by id of a scene."""
     return {one.id: one.operation for one in publisher.sent[which].world.collision_objects}
-
-
-# Outputs
 
 
 def test_nothing_is_created_before_it_is_asked_for(node):
@@ -378,9 +370,6 @@ def soft(package: str) -> Any:
     return sys.modules[f"{package}.msg"]
 
 
-# Findings and their frame
-
-
 FRAMES = {
     "map": (quaternions.from_rotation_vector(np.array([0.3, -1.1, 0.7])), np.array([1.0, -2.0, 0.5])),
     "base": (np.array([0, 0, 0, 1.0]), np.zeros(3)),
@@ -459,9 +448,6 @@ def test_a_missing_transform_refuses_the_frame(node, tf2, monkeypatch):
     assert in_frame(found(1), CameraPoses(node), "camera").header.frame_id == "camera", "needs no tf2"
 
 
-# Poses of the camera
-
-
 def test_all_frames_share_one_listener_and_none_is_there_before(node, tf2):
     camera_poses = CameraPoses(node)
     assert tf2.listeners == 0
@@ -491,7 +477,7 @@ def test_another_fixed_frame_is_another_world(node, tf2):
 
     assert [identified(fixed) for fixed in ("", "", "map", "map", "base", "")] == [(1,), (1,), (2,), (2,), (3,), (4,)]
     assert [text.split(":")[0] for text in node.said] == [
-        *("fixed_frame is map from now on", "fixed_frame is base from now on", "fixed_frame is none from now on")
+        f"fixed_frame is {name} from now on" for name in ("map", "base", "none")
     ]
     assert tracking.tally.without_pose == 0
     identified("moon")
@@ -509,9 +495,6 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
     second = identified(RecoverParameters(), one(CAN, 1))
     assert (second.ids, second.hidden) == ((2,), (1,))
     assert identified(RecoverParameters(tracking=False), one(CAN, 1)).hidden == ()
-
-
-# Parameters
 
 
 @pytest.mark.parametrize(

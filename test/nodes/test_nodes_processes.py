@@ -1,11 +1,8 @@
 """The nodes as processes of their own: a peer beside them sends images, parameters and signals."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
@@ -17,10 +14,8 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from started_nodes import Child
 from std_srvs.srv import SetBool
 
-from sq_msgs_py.depth_image import depth_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.geometry.metrics import volume_iou
-from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.frame import stamp_of
 from sq_perception.recordings.publication import superquadrics
 
@@ -77,26 +72,6 @@ def recover_node(start: Callable[..., Process]) -> Iterator[Process]:
     process.says("ready")
     yield process
     stopped(process, times=2)
-
-
-def test_empty_tiny_and_swapped_frames_are_answered(recover_node, peer):
-    native, info = peer.frame(BODY)
-    for value in (float("nan"), 0.0, float("inf"), -1.0):
-        image = depth_to_message(np.full((120, 160), value), peer.header())
-        assert len(answer(peer, recover_node, image, info)) == 0
-    zeros = depth_to_message(np.zeros((120, 160)), peer.header(), "16UC1")
-    assert len(answer(peer, recover_node, zeros, info)) == 0
-
-    _, one = peer.frame(BODY, Camera(1, 1, 100.0, 100.0, 0.0, 0.0))
-    for value in (float("nan"), 0.5):
-        image = depth_to_message(np.full((1, 1), value), peer.header())
-        assert len(answer(peer, recover_node, image, one)) <= 1
-
-    swapped, _ = peer.frame(BODY)
-    swapped.is_bigendian = 1
-    swapped.data = np.frombuffer(native.data, "<f4").astype(">f4").tobytes()
-    first, second = (answer(peer, recover_node, image, info) for image in (native, swapped))
-    np.testing.assert_allclose(second.size, first.size, rtol=1e-4)
 
 
 def test_parameters_change_from_another_process(recover_node, peer):
@@ -163,25 +138,18 @@ def test_a_deaf_subscription_names_the_publisher(peer, start):
     stopped(process, number=signal.SIGTERM)
 
 
-def test_a_corrupt_model_ends_the_start_with_a_reason(start, tmp_path):
-    path = tmp_path / "model.safetensors"
-    path.write_bytes(b"no safetensors at all")
-    process = start("recover_node", f"model:={path}")
-    assert process.wait(PATIENCE) == 1
-    assert "cannot start" in process.output()
-    assert str(path) in process.output()
-    assert "Traceback" not in process.output()
-
-
 @pytest.mark.parametrize(
-    ("parameter", "words"),
+    ("node", "parameter", "before", "words"),
     [
-        ("qos_overrides./depth/image.subscription.reliability:=perhaps", "perhaps"),
-        ("device:=tpu", "expected cpu, cuda or cuda:N"),
+        ("recover_node", "qos_overrides./depth/image.subscription.reliability:=perhaps", (), "perhaps"),
+        ("recover_node", "device:=tpu", (), "expected cpu, cuda or cuda:N"),
+        ("recover_node", f"model:={__file__}", (), __file__),
+        ("recover_cameras", "autostart:=false", ("front", "wrist", "--ros-args", "-r", "__ns:=/arm"),
+         "front and wrist are both /arm/recover_node"),
     ],
-)
-def test_a_bad_parameter_ends_the_start_with_a_reason(start, parameter, words):
-    process = start("recover_node", parameter)
+)  # fmt: skip
+def test_what_cannot_be_started_ends_with_a_reason(start, node, parameter, before, words):
+    process = start(node, parameter, before=before)
     assert process.wait(PATIENCE) == 1
     assert words in process.output()
     assert "Traceback" not in process.output()
@@ -194,13 +162,6 @@ def test_bodies_of_two_cameras_have_names_of_their_own(peer, start):
     prefixes = [peer.get(f"/{one}/recover_node", "tf_prefix", alive=(process,)) for one in ("front", "arm/wrist")]
     assert prefixes == [["front_superquadric_"], ["arm_wrist_superquadric_"]]
     stopped(process)
-
-
-def test_cameras_that_would_have_one_name_are_refused(start):
-    process = start("recover_cameras", before=["front", "wrist", "--ros-args", "-r", "__ns:=/arm"])
-    assert process.wait(PATIENCE) == 1
-    assert "front and wrist are both /arm/recover_node" in process.output()
-    assert "Traceback" not in process.output()
 
 
 def test_ctrl_c_during_the_start_leaves_no_traceback(start):

@@ -1,7 +1,5 @@
 """Tracking in a frame node, between real publishers and subscribers: ids, resets, failed bodies, moving cameras."""
 
-from __future__ import annotations
-
 import sys
 import threading
 from collections.abc import Callable
@@ -22,9 +20,8 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import depth_to_message
-from sq_perception.fitting.fit import Status
+from sq_perception import Status, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 
 
 def grown(body: Superquadric, share: float) -> Superquadric:
@@ -71,8 +68,7 @@ def test_ids_and_forms_last_and_numbers_are_fused(make_bench):
         other = grown(BOX, 0.03 * (-1) ** k).equivalent_forms()[k]
         bench.recoverer.bodies = (recovery(CAN, 1), recovery(BOX, 7, Status.FAILED), recovery(other, 2))
         _, found = bench.answer(image(10 + 0.1 * k))
-        assert found.id.tolist() == [2, 2**31 + 7, 1]
-        assert found.status.tolist() == [0, 2, 0]
+        assert (found.id.tolist(), found.status.tolist()) == ([2, 2**31 + 7, 1], [0, 2, 0])
         assert quaternions.geodesic_angle(found.rotation[2].astype(float), first.rotation[0].astype(float)) < 0.01
         np.testing.assert_allclose(found.size[2], BOX.size, rtol=0.021)
     assert (found.sigma_size[2] < first.sigma_size[0]).all()
@@ -88,9 +84,8 @@ def test_ids_and_forms_last_and_numbers_are_fused(make_bench):
     bench.until(lambda: len(shown) == 9)
     assert {(m.id, m.action) for m in shown[-1].markers[1:]} == {(2, Marker.ADD)}
     values = report()
-    assert [values[name] for name in ("track ids given", "track resets", "frames without camera pose")] == [
-        *("2", "0", "0")
-    ]
+    counts = [values[name] for name in ("track ids given", "track resets", "frames without camera pose")]
+    assert counts == ["2", "0", "0"]
 
 
 def test_a_bag_that_begins_again_resets_once(make_bench, capfd):
@@ -125,7 +120,7 @@ def test_another_method_ends_the_tracks(make_bench, capfd):
     np.testing.assert_allclose(found.size[0], 1.05 * BOX.size, rtol=1e-6)
     bench.set(bench.node, method="symmetry")
     assert bench.answer(image(10.3))[1].id.tolist() == [3]
-    bench.set(bench.node, s=50.0)
+    bench.set(bench.node, s=50.0, threads=2)
     assert bench.answer(image(10.4))[1].id.tolist() == [3]
     assert capfd.readouterr().err.count("bodies come from another method or model") == 2
 

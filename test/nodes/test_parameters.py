@@ -1,11 +1,9 @@
 """Parameters: descriptors say what the checks do, and the shipped YAML files hold the defaults."""
 
-from __future__ import annotations
-
 import importlib
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
 import pytest
@@ -193,6 +191,11 @@ def test_a_check_may_refuse_and_a_listener_hears_what_was_set(make_node):
     node.declare_parameter("qos_overrides.somewhere", "reliable")
     assert live.current is kept, "parameters of others"
     assert len(heard) == 1
+
+
+def test_fitter_node_asks_for_the_classic_method_and_nothing_else():
+    one, other = FitterParameters().recovery_options(), RecoverParameters().recovery_options()
+    assert one == replace(other, method="classic")
 
 
 @pytest.mark.parametrize("given", [[0, -1, 0, 1, 1, 2], [0.0, -1.0, 0.0, 1.0, 1.0, 2.0]])

@@ -4,8 +4,6 @@ RViz2 itself is no part of the tests.  Class names, property names and their spe
 jazzy; what is listed here is that reading.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -37,15 +35,12 @@ RELIABLE_TOPICS = {"/recover_node/markers", "/fitter_node/markers", "/grasp_node
 
 @pytest.fixture
 def configuration(repository: Path) -> dict[str, Any]:
-    text = (repository / "config" / "superquadrics.rviz").read_text(encoding="utf-8")
-    loaded: dict[str, Any] = yaml.safe_load(text)
-    return loaded
+    return yaml.safe_load((repository / "config" / "superquadrics.rviz").read_text(encoding="utf-8"))
 
 
 @pytest.fixture
 def displays(configuration: dict[str, Any]) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = configuration["Visualization Manager"]["Displays"]
-    return found
+    return configuration["Visualization Manager"]["Displays"]
 
 
 def test_displays_have_the_properties_of_their_classes(displays: list[dict[str, Any]]) -> None:
@@ -68,9 +63,7 @@ def test_topics_have_a_quality_of_service_that_hears_their_publishers(displays: 
     assert cloud["Reliability Policy"] == "Best effort"  # this one display spells it so
 
 
-def test_topics_and_frame_are_those_of_the_nodes(
-    configuration: dict[str, Any], displays: list[dict[str, Any]], repository: Path
-) -> None:
+def test_topics_and_frame_are_those_of_the_nodes(configuration, displays, repository) -> None:
     """Every name stands as a literal in the nodes' code, private ones with their ~."""
     code = "".join(path.read_text(encoding="utf-8") for path in (repository / "sq_perception" / "nodes").glob("*.py"))
     named = [one["Topic"]["Value"] for one in displays if "Topic" in one]
@@ -79,15 +72,13 @@ def test_topics_and_frame_are_those_of_the_nodes(
         node, _, name = topic.removeprefix("/").partition("/")
         literal = f'"~/{name}"' if node in ("recover_node", "fitter_node", "grasp_node") else f'"{node}/{name}"'
         assert literal in code, topic
-    frame = configuration["Visualization Manager"]["Global Options"]["Fixed Frame"]
-    assert frame == CAMERA_FRAME
+    assert configuration["Visualization Manager"]["Global Options"]["Fixed Frame"] == CAMERA_FRAME
 
 
 def test_the_view_looks_along_the_camera_and_stands_upright(configuration: dict[str, Any]) -> None:
     """Orbit, as RViz computes it: the eye at focal point + distance (cy cp, sy cp, sp), z of the fixed frame up."""
-    manager = configuration["Visualization Manager"]
-    assert manager["Global Options"]["Fixed Frame"] == "camera_depth_optical_frame"
-    for view in (manager["Views"]["Current"], *manager["Views"]["Saved"]):
+    views = configuration["Visualization Manager"]["Views"]
+    for view in (views["Current"], *views["Saved"]):
         yaw, pitch = view["Yaw"], view["Pitch"]
         assert abs(pitch) < math.pi / 2 - 0.001  # the limit of RViz
         outwards = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)])
@@ -98,19 +89,15 @@ def test_the_view_looks_along_the_camera_and_stands_upright(configuration: dict[
         assert forwards[2] > 0  # away from the camera
         assert up[1] < 0  # optical y points down
         np.testing.assert_allclose(right, [1, 0, 0], atol=1e-5)
-    current = manager["Views"]["Current"]
-    focal = np.array([current["Focal Point"][axis] for axis in "XYZ"])
-    assert 0.3 < focal[2] < 2.0  # where the things on the synthetic table are
+    assert 0.3 < views["Current"]["Focal Point"]["Z"] < 2.0  # where the things on the synthetic table are
 
 
-def test_what_rviz_does_not_forgive_is_there(configuration: dict[str, Any]) -> None:
+def test_what_rviz_does_not_forgive_is_there(configuration, displays) -> None:
     """RViz reads these two into variables without a value of their own, and lets panels float without a state."""
     window = configuration["Window Geometry"]
-    assert window["Hide Left Dock"] is False
-    assert window["Hide Right Dock"] is False
+    assert (window["Hide Left Dock"], window["Hide Right Dock"]) == (False, False)
     state = bytes.fromhex(window["QMainWindow State"])
     panels = {one["Name"] for one in configuration["Panels"]}
-    displays = configuration["Visualization Manager"]["Displays"]
     images = {one["Name"] for one in displays if one["Class"] == "rviz_default_plugins/Image"}
     for name in panels | images:
         assert name.encode("utf-16-be") in state, name

@@ -6,8 +6,6 @@ What is built is found only by processes that start with its folders in their en
 ``sq_msgs_built.py``, which is run by a pytest of its own.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -41,7 +39,7 @@ def test_the_interfaces_are_built_and_nodes_use_them(repository: Path, tmp_path:
     options += [f"-DPython3_EXECUTABLE={sys.executable}", f"-DCMAKE_PROJECT_INCLUDE={HERE / 'wheels.cmake'}"]
     for source in (repository / "sq_msgs", HERE / "detector_interfaces"):
         run(["cmake", "-S", str(source), "-B", str(build / source.name), *options], environment)
-        run(["cmake", "--build", str(build / source.name), "--target", "install"], environment)
+        run(["cmake", "--build", str(build / source.name), "--target", "install", "--parallel", "2"], environment)
 
     after = {
         "AMENT_PREFIX_PATH": os.pathsep.join([str(built), *prefixes]),

@@ -1,7 +1,5 @@
 """What /diagnostics says is of the last seconds, and names what a look at the robot needs."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

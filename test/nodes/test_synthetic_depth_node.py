@@ -1,7 +1,5 @@
 """Frames of synthetic_depth_node: seeded, held, looped, replayed, and refused where a file or a parameter is wrong."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -74,12 +72,8 @@ def test_a_sensor_measures_the_scene_it_is_held_at():
 
 
 def test_scenes_end_or_begin_again():
-    assert names(frame_source(SyntheticParameters(scenes=2, hold=2, loop=False)), 6) == [
-        *["table scene 0"] * 2,
-        *["table scene 1"] * 2,
-        None,
-        None,
-    ]
+    ending = names(frame_source(SyntheticParameters(scenes=2, hold=2, loop=False)), 6)
+    assert ending == ["table scene 0"] * 2 + ["table scene 1"] * 2 + [None] * 2
     assert names(frame_source(SyntheticParameters(scenes=2, hold=1)), 4)[2:] == ["table scene 0", "table scene 1"]
 
 
@@ -88,8 +82,7 @@ def test_the_truth_of_thesis_scenes_is_in_the_cube_frame():
     assert frame.is_cube
     assert frame.camera == unit_cube.camera(256)
     u, v = unit_cube.camera(256).project(unit_cube.optical_from_cube(frame.truth).translation[0])
-    assert frame.labels[round(v), round(u)] == 1
-    assert frame.truth.translation[0, 1] == pytest.approx(1 - v / 255)
+    assert (frame.labels[round(v), round(u)], frame.truth.translation[0, 1]) == (1, pytest.approx(1 - v / 255))
 
 
 def test_a_folder_is_replayed_in_order_and_a_recording_alone(recordings):

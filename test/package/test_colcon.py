@@ -1,7 +1,5 @@
 """colcon builds the workspace, and what it installs is what ROS tools look for."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -9,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from python_process import run_python
 
 pytest.importorskip("colcon_core", reason="colcon is missing: install the extra 'test'")
 catkin_package = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg is missing: install the extra 'test'")
@@ -22,11 +21,8 @@ def built(source: Path, workspace: Path, *options: str) -> Path:
     shutil.copytree(source, workspace / "src" / PACKAGE)
     environment = {**os.environ, "COLCON_HOME": str(workspace / "home"), "COLCON_LOG_LEVEL": "30"}
     environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    result = subprocess.run(
-        [sys.executable, "-m", "colcon", "build", "--base-paths", "src", "--executor", "sequential", *options],
-        cwd=workspace, env=environment, capture_output=True, text=True, timeout=300,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
+    words = ("build", "--base-paths", "src", "--executor", "sequential", *options)
+    result = run_python("-m", "colcon", *words, cwd=workspace, env=environment)
     assert f"Finished <<< {PACKAGE}" in result.stdout
     assert "Deprecat" not in result.stderr
     return workspace / "install"
@@ -51,9 +47,7 @@ def test_package_xml_is_well_formed(repository: Path) -> None:
     """An invalid e-mail makes colcon treat the package as plain Python, without a word."""
     package = catkin_package.parse_package(str(repository / "package.xml"))
     package.validate()
-    assert package.name == PACKAGE
-    assert package.get_build_type() == "ament_python"
-    assert package.licenses == ["Apache-2.0"]
+    assert (package.name, package.get_build_type(), package.licenses) == (PACKAGE, "ament_python", ["Apache-2.0"])
     assert all("@" in person.email for person in package.maintainers)
 
 
@@ -81,16 +75,13 @@ def test_a_workspace_of_links_is_whole(source_copy: Path, tmp_path: Path) -> Non
     assert all(os.access(prefix / "lib" / PACKAGE / name, os.X_OK) for name in EXECUTABLES)
 
 
-def test_the_sourced_workspace_is_on_the_ament_path_and_its_package_is_the_one_that_runs(
-    install: Path, tmp_path: Path
-) -> None:
-    code = "import os, sq_perception, sq_msgs_py; print(os.environ['AMENT_PREFIX_PATH'])\n"
-    code += "print(sq_perception.__file__); print(sq_msgs_py.__file__)"
-    result = sourced(install, ["python3", "-c", code], tmp_path)
-    path, *files = result.stdout.splitlines()
+def test_the_sourced_workspace_is_on_the_ament_path_and_its_package_is_the_one_that_runs(install, tmp_path) -> None:
+    code = "import os, sq_perception as one, sq_msgs_py as other; print(os.environ['AMENT_PREFIX_PATH'])\n"
+    result = sourced(install, ["python3", "-c", code + "print(one.__file__); print(other.__file__)"], tmp_path)
+    path, one, other = result.stdout.splitlines()
     assert str(install / PACKAGE) in path.split(os.pathsep), result.stderr
-    assert len(files) == 2
-    assert all(str(install) in file for file in files)
+    assert str(install) in one
+    assert str(install) in other
 
 
 def test_executables_run(install: Path, tmp_path: Path) -> None:

@@ -1,15 +1,13 @@
 """Every script of examples/ runs as it stands, in a folder of its own, and its numbers are those of the sample."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import runpy
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from python_process import run_python
 
 from sq_perception.simulation.sample import THINGS
 
@@ -59,18 +57,15 @@ def test_the_example_of_a_node_reads_what_recover_node_answers(tmp_path):
     remapped = ["--ros-args", "-r", "depth/image:=/camera/depth", "-r", "depth/camera_info:=/camera/info"]
     with children() as running:
         node = running.start("recover_node", remapped)
-        command = [sys.executable, str(EXAMPLES / "ros_node.py")]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        assert done.returncode == 0, "\n".join([done.stderr, *node.last_lines()])
-    assert len(re.findall(r"^\d+ x \d+ x \d+ mm at", done.stdout, re.MULTILINE)) == len(THINGS), done.stdout
+        done = run_python(EXAMPLES / "ros_node.py", cwd=tmp_path)
+        found = re.findall(r"^\d+ x \d+ x \d+ mm at", done.stdout, re.MULTILINE)
+        assert len(found) == len(THINGS), "\n".join([done.stdout, *node.last_lines()])
 
 
 def test_an_arm_clears_the_table_by_what_the_nodes_answer(tmp_path):
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     pytest.importorskip("mujoco", reason="needs the extra 'picking'")
     film = tmp_path / "arm.gif"
-    command = [sys.executable, str(EXAMPLES / "pick_with_an_arm.py"), "--film", str(film)]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=600)
+    done = run_python(EXAMPLES / "pick_with_an_arm.py", "--film", film, cwd=tmp_path)
     assert "the table is empty" in done.stdout, done.stdout + done.stderr
-    assert done.returncode == 0
     assert film.read_bytes()[:3] == b"GIF"

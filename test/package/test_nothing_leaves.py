@@ -3,8 +3,6 @@
 Real processes, with a HOME that is empty and a network in which every packet is seen (``sealed_network.py``).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
@@ -16,7 +14,7 @@ import sealed_network
 import sq_perception
 
 PACKAGE = Path(sq_perception.__file__).parent
-NODE_SECONDS = 20
+NODE_SECONDS = 12
 """A release with telemetry on looked a name up every 7 s."""
 
 

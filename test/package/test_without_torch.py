@@ -1,15 +1,14 @@
 """A robot needs no torch: what recovers runs where it cannot be imported, and what trains says what is missing."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from python_process import run_python
 
 import sq_perception
+from sq_perception.learning import checkpoint
+from sq_perception.learning.networks import Regressor, RegressorConfig
 
 ABSENT = f"""
 import sys
@@ -23,14 +22,11 @@ sys.meta_path.insert(0, Absent())
 REMEDY = "needs torch: pip install 'sq_perception[train]'"
 
 
-def run(code: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", ABSENT + code], cwd=folder, capture_output=True, text=True, check=False, timeout=600
-    )
-
-
-def command(arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    return run(f"from sq_perception.commands.main import main; sys.exit(main({arguments.split()!r}))", folder)
+def run(folder: Path, *each: str) -> tuple[str, str]:
+    """What commands, one after the other, say on standard error, and their exit codes."""
+    code = f"from sq_perception.commands.main import main; print([main(one.split()) for one in {each!r}])"
+    done = run_python("-c", ABSENT + code, cwd=folder)
+    return done.stderr, done.stdout.splitlines()[-1]
 
 
 @pytest.fixture
@@ -43,11 +39,8 @@ def frame(tmp_path: Path) -> Path:
 
 def test_recover(frame: Path) -> None:
     methods = ["auto", "network", "network --model supervised", "symmetry", "classic"]
-    each = [f"recover a.npz --json {k}.json --method {method}".split() for k, method in enumerate(methods)]
-    done = run(
-        f"from sq_perception.commands.main import main; sys.exit(str([main(words) for words in {each!r}]))", frame
-    )
-    assert done.stderr.splitlines()[-1] == str([0] * len(methods)), done.stderr
+    said, codes = run(frame, *(f"recover a.npz --json {k}.json --method {method}" for k, method in enumerate(methods)))
+    assert codes == str([0] * len(methods)), said
     assert len(list(frame.glob("*.json"))) == len(methods)
 
 
@@ -63,25 +56,13 @@ assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
 assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
 assert "torch" not in sys.modules
 """
-    done = run(code, tmp_path)
-    assert done.returncode == 0, done.stderr
+    run_python("-c", ABSENT + code, cwd=tmp_path)
 
 
-@pytest.mark.parametrize(
-    "arguments", ["train --output run", "evaluate --output out", "recover a.npz --model thesis.safetensors"]
-)
-def test_what_needs_torch_says_so(arguments: str, frame: Path) -> None:
-    if "thesis" in arguments:
-        from sq_perception.learning import checkpoint
-        from sq_perception.learning.networks import Regressor, RegressorConfig
-
-        checkpoint.save(frame / "thesis.safetensors", Regressor(RegressorConfig.thesis()))
-    done = command(arguments, frame)
-    assert done.returncode == 1
-    assert REMEDY in done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_a_device_that_needs_torch(tmp_path: Path) -> None:
-    done = run("from sq_perception import Recoverer; Recoverer(device='cuda')", tmp_path)
+def test_what_needs_torch_says_so(frame: Path) -> None:
+    checkpoint.save(frame / "thesis.safetensors", Regressor(RegressorConfig.thesis()))
+    said, codes = run(frame, "train --output run", "evaluate --output out", "recover a.npz --model thesis.safetensors")
+    assert codes == "[1, 1, 1]", said
+    assert said.count(REMEDY) == 3
+    done = run_python("-c", ABSENT + "from sq_perception import Recoverer; Recoverer(device='cuda')", code=1)
     assert f"ValueError: device: 'cuda' {REMEDY}" in done.stderr

@@ -1,7 +1,5 @@
 """One camera, as the tools of many write it, and what is said where it is not all there."""
 
-from __future__ import annotations
-
 import json
 
 import cv2
@@ -37,6 +35,11 @@ FORMS = {
     "four.txt": "60.0 61.0 31.5 23.5\n",
     "four.csv": "60.0,61.0,31.5,23.5",
     "nine.txt": " ".join(map(str, ROWS)),
+    "lines.txt": "60 0 31.5\n0 61 23.5\n0 0 1\n",
+    "plain.yaml": "fx: 60\nfy: 61\ncx: 31.5\ncy: 23.5\n",
+    "one_scene.json": json.dumps({"cam_K": ROWS}),
+    "scaled.json": json.dumps({"fx": 60, "fy": 61, "cx": 31.5, "cy": 23.5, "depth_scale": 1.0}),
+    "sixteen.csv": "60,0,31.5,0\n0,61,23.5,0\n0,0,1,0\n0,0,0,1\n",
     "scannet.txt": "fx_color = 1170.1\nfy_color = 1170.1\nmx_color = 647.7\ncolorWidth = 1296\ncolorHeight = 968\n"
     "depthWidth = 64\ndepthHeight = 48\nm_calibrationColorIntrinsic = 1170 0 647 0 0 1170 483 0 0 0 1 0 0 0 0 1\n"
     "m_calibrationDepthIntrinsic = 60 0 31.5 0 0 61 23.5 0 0 0 1 0 0 0 0 1\n",
@@ -71,7 +74,9 @@ def test_an_archive_is_the_same_camera(tmp_path, names):
     assert read_calibration(tmp_path / "camera.npz", size=SIZE).camera == CAMERA
 
 
-def test_distortion_comes_along(tmp_path):
+def test_distortion_comes_along_and_three_numbers_are_no_camera(tmp_path):
+    with pytest.raises(FrameError, match="expected four numbers, fx,fy,cx,cy, got 3"):
+        read_calibration("60,61,31.5", size=SIZE)
     path = tmp_path / "cam.yaml"
     path.write_text("Camera.fx: 60\nCamera.fy: 61\nCamera.cx: 31.5\nCamera.cy: 23.5\nCamera.k1: 0.1\nCamera.p2: 0.01\n")
     assert read_camera_info(path, SIZE).d[:4] == (0.1, 0, 0, 0.01)
@@ -80,24 +85,50 @@ def test_distortion_comes_along(tmp_path):
     assert (info.distortion_model, info.d) == ("equidistant", (0.1, 0.2, 0.3, 0.4))
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("60,61,31.5", "expected four numbers, fx,fy,cx,cy, got 3"),
+WRONG = {
+    "camera.txt": [
         ('{"fx": 60, "fy": 61, "cx": 31.5}', "expected cy .* beside fx, fy, cx"),
         ('{"K": [1, 0, 0, 0, 1, 0, 0, 0, 1]}', "identity"),
         ('{"fx": 0.9, "fy": 0.9, "cx": 0.5, "cy": 0.5}', "divided by the size of the image"),
         ('{"a": {"fx": 60, "fy": 61, "cx": 1, "cy": 1}, "b": {"fx": 70, "fy": 71, "cx": 1, "cy": 1}}', "got 2: a, b"),
         ("1 FOV 64 48 1 2 3 4 5", "expected a model of SIMPLE_PINHOLE"),
     ],
+    "camera.json": [
+        ("[" * 100_000, "not JSON"),
+        ("[1]", "3 x 3"),
+        ('{"ppx": 1, "ppy": 2}', "expected fx, fy .* beside cx, cy"),
+        (json.dumps({**REALSENSE, "model": "F-Theta"}), "F-Theta"),
+        (json.dumps({**REALSENSE, "fx": 10**400}), "expected numbers"),
+        ('{"k": [60, 0, 31.5, 0, 61, 23.5, 1, 0, 1]}', "0 0 1 in its last row"),
+    ],
+    "info.yaml": [
+        ("", "mapping"),
+        ("[1, 2", "four numbers"),
+        ("{1, 2", "not YAML"),
+        ("just text", "mapping"),
+        ("!!python/object/apply:os.system ['true']", "not YAML"),
+        ("{image_width: 64, k: [9, 0, 0, 0, 9, 0, 0, 0, 1]}", "image_height"),
+        ("{image_width: wide, image_height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1]}", "positive integer"),
+        ("{image_width: 64, image_height: 48}", "camera_matrix"),
+        ("{image_width: 64, image_height: 48, k: [1, 2]}", "4 or 9 or 12 or 16 finite numbers"),
+        ("{image_width: 64, image_height: 48, k: [a, b]}", "expected numbers"),
+        ("{width: 64, height: 48, k: [0, 0, 0, 0, 0, 0, 0, 0, 0]}", "above 0"),
+        ("{width: 64, height: 48, k: [9, 1, 0, 0, 9, 0, 0, 0, 1]}", "no skew"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], binning_x: -1}", "binning_x"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: {x_offset: a}}", "x_offset"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: 3}", "roi"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], d: [.nan]}", "finite"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"), [(name, *case) for name in WRONG for case in WRONG[name]], ids=lambda word: word[:30]
 )
-def test_what_is_missing_is_named(tmp_path, text, said):
-    source = text
-    if not text[0].isdigit() or " " in text:
-        source = tmp_path / "camera.txt"
-        source.write_text(text)
+def test_what_is_no_camera_is_named(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
     with pytest.raises(FrameError, match=said):
-        read_calibration(source, size=SIZE)
+        read_calibration(tmp_path / name, size=SIZE)
 
 
 def scene(folder, scale):
@@ -116,8 +147,7 @@ def test_the_camera_and_unit_of_each_image_of_a_scene_are_found_and_used(tmp_pat
     folder = scene(tmp_path / "scene", [0.1, 1.0])
     for number, unit in enumerate((10000, 1000)):
         frame = sq.read_frame(folder / f"{number:06d}.png")
-        assert frame.depth[0, 0] == pytest.approx(0.8)
-        assert frame.camera.fx == 60 + number
+        assert (frame.depth[0, 0], frame.camera.fx) == (pytest.approx(0.8), 60 + number)
         assert f"{unit} units are a metre: scene_camera.json: depth_scale" in frame.notes
     given = sq.read_frame(folder / "000000.png", reading=Reading(scale=1000.0))
     assert given.depth[0, 0] == pytest.approx(8.0)
@@ -133,8 +163,7 @@ def test_a_stated_unit_holds_for_every_kind_of_file(tmp_path, name):
     intrinsics = {"fx": 60, "fy": 61, "ppx": 31.5, "ppy": 23.5, "depth_scale": 0.00012498664727900177}
     (tmp_path / "intrinsics.json").write_text(json.dumps(intrinsics))
     frame = sq.read_frame(tmp_path / name)
-    assert frame.camera == CAMERA
-    assert frame.depth[0, 0] == pytest.approx(0.8, abs=1e-3)
+    assert (frame.camera, frame.depth[0, 0]) == (CAMERA, pytest.approx(0.8, abs=1e-3))
     assert "metres a unit" in frame.notes
 
 

@@ -1,20 +1,16 @@
 """Clouds: an organised one is the image that it came from, any other one is seen again, and nothing hostile is read."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from sq_perception import Camera, Recoverer, RecoveryOptions, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
 from sq_perception.recordings import cloud_file
 from sq_perception.recordings.cloud_file import UNORGANISED, CloudFrame, move
 from sq_perception.recordings.frame_file import FrameError, Reading, read
-from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation import support_plane
 
 CAMERA = Camera(160, 120, 210.0, 200.0, 80.5, 58.25)
@@ -73,6 +69,8 @@ def test_an_organised_cloud_is_its_depth_image(tmp_path, kind):
     path = pcd(tmp_path / "a.pcd", 1e3 * cloud)
     path.write_bytes("# a comment may have any letters: mesuré\n".encode() + path.read_bytes())
     assert read(path, reading=Reading(scale=1000.0)).depth[50, 50] == frame.depth[50, 50]
+    with pytest.raises(FrameError, match="z forward"):
+        read(pcd(tmp_path / "behind.pcd", -cloud, kind))
 
 
 def test_lzf_copies_what_came_before_and_stays_within_its_buffers():
@@ -214,18 +212,14 @@ def test_axes_around_the_camera_have_names(name, point):
     """A point a metre before the camera, 0.2 m to its right and 0.1 m below."""
     seen, _ = CloudFrame.parse(name).to_optical(np.array([point]))
     np.testing.assert_allclose(seen, [[0.2, 0.1, 1.0]], atol=1e-12)
+    down, _ = CloudFrame.parse("0,0,1").to_optical(np.array([[x, y, 1e-9] for x in (-0.2, 0.2) for y in (-0.2, 0.2)]))
+    np.testing.assert_allclose(down[:, 2], 1.0, atol=0.02)
 
 
 @pytest.mark.parametrize("text", ["", "up", "1,2", "1,2,3,4", "1,2,nan", "0,0,0,0,0,0,0"])
 def test_what_is_no_place_of_a_camera_is_refused(text):
     with pytest.raises(ValueError, match="expected where the camera stood"):
         CloudFrame.parse(text)
-
-
-def test_a_camera_may_look_straight_down(rng):
-    flat = np.concatenate([rng.uniform(-0.2, 0.2, (500, 2)), np.zeros((500, 1))], axis=1) + 1e-9
-    seen, _ = CloudFrame.parse("0,0,1").to_optical(flat)
-    np.testing.assert_allclose(seen[:, 2], 1.0, atol=0.02)
 
 
 def test_no_free_space_means_that_what_is_beside_says_nothing(monkeypatch):
@@ -250,10 +244,7 @@ def test_no_free_space_means_that_what_is_beside_says_nothing(monkeypatch):
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 100000\nHEIGHT 100000\nDATA binary\n", "points, got"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary\n1234", "not a readable cloud"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA zipped\n", "got zipped"),
-        (
-            b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary_compressed\n1234",
-            "not a readable cloud",
-        ),
+        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 9\nHEIGHT 1\nDATA binary_compressed\n1234", "not a readable"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA ascii\n1 2 3\n", "or more"),
     ],
 )
@@ -277,7 +268,3 @@ def test_a_cloud_in_the_frame_of_a_table_or_robot_is_refused_with_what_is_not_se
         read(tmp_path / "a.ply")
 
 
-def test_a_cloud_behind_the_camera_is_named(tmp_path):
-    _, cloud = points()
-    with pytest.raises(FrameError, match="z forward"):
-        read(pcd(tmp_path / "a.pcd", -cloud))

@@ -1,7 +1,5 @@
 """Depth images and intrinsics as other tools write them, and what is taken of an image."""
 
-from __future__ import annotations
-
 import json
 import sys
 
@@ -26,29 +24,6 @@ def save(path, value=1000, dtype=np.uint16):
     return path
 
 
-def as_json(path, content):
-    path.write_text(json.dumps(content))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        ("[" * 100_000, "not JSON"),
-        ([1], "3 x 3"),
-        ({"ppx": 1, "ppy": 2}, "expected fx, fy .* beside cx, cy"),
-        ({"width": 64, "height": 48, "fx": 1, "fy": 1, "ppx": 1, "ppy": 1, "model": "F-Theta"}, "F-Theta"),
-        ({"width": 64, "height": 48, "fx": 10**400, "fy": 1, "ppx": 1, "ppy": 1}, "expected numbers"),
-        ({"k": [60, 0, 31.5, 0, 61, 23.5, 1, 0, 1]}, "0 0 1 in its last row"),
-    ],
-)
-def test_other_json_says_what_was_expected(tmp_path, content, said):
-    path = tmp_path / "camera.json"
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    with pytest.raises(FrameError, match=said):
-        read(save(tmp_path / "a.png"), path)
-
-
 @pytest.mark.parametrize(
     ("name", "value", "dtype"),
     [
@@ -58,8 +33,7 @@ def test_other_json_says_what_was_expected(tmp_path, content, said):
 )
 def test_a_file_has_the_units_of_its_type(tmp_path, name, value, dtype):
     frame = read(save(tmp_path / name, value, dtype), NUMBERS)
-    assert frame.depth.dtype == np.float32
-    assert frame.depth[1, 1] == pytest.approx(0.8)
+    assert (frame.depth.dtype, frame.depth[1, 1]) == (np.float32, pytest.approx(0.8))
     assert np.isnan(frame.depth[0, 0])
     if name == "a.tiff":
         (tmp_path / "b.tif").write_bytes((tmp_path / name).read_bytes()[:100])
@@ -145,7 +119,7 @@ def test_what_is_taken_of_an_image(tmp_path):
     path = tmp_path / "a.npz"
     depth = np.tile(np.linspace(0.5, 1.5, 64, dtype=np.float32), (48, 1))
     labels = np.arange(48 * 64, dtype=np.int32).reshape(48, 64)
-    np.savez(path, depth=depth, labels=labels, K=[[60, 0, 31.5], [0, 61, 23.5], [0, 0, 1]])
+    np.savez(path, depth=depth, labels=labels, K=CAMERA.matrix)
     whole, frame = read(path), read(path, reading=Reading(nearest=0.7, farthest=1.2, region=(10, 5, 50, 40)))
     part = np.s_[5:45, 10:60]
     is_within = (depth[part] >= 0.7) & (depth[part] <= 1.2)
@@ -168,25 +142,13 @@ def test_limits_that_leave_nothing_are_refused(wrong):
 
 
 def test_masks_are_found_by_name(tmp_path):
-    folder = tmp_path / "masks"
-    folder.mkdir()
-    reading = Reading(masks=folder)
-    path = save(tmp_path / "a.png")
+    """Plain images of labels, the indices of a palette, and the binary images of BOP."""
+    path, plain = save(tmp_path / "000003.png"), tmp_path / "masks"
+    plain.mkdir()
     with pytest.raises(FrameError, match="no such mask"):
-        read(path, NUMBERS, reading=reading)
-    labels = np.zeros((48, 64), np.uint8)
-    labels[10:20, 10:20] = 7
-    cv2.imwrite(str(folder / "a.png"), labels)
-    np.testing.assert_array_equal(read(path, NUMBERS, reading=reading).labels, labels)
-    cv2.imwrite(str(folder / "a.png"), labels[:-1])
-    with pytest.raises(FrameError, match="shape"):
-        read(path, NUMBERS, reading=reading)
-
-
-def test_masks_are_the_indices_of_a_palette_and_binary_images_of_bop(tmp_path):
+        read(path, NUMBERS, reading=Reading(masks=plain))
     labels = np.zeros((48, 64), np.uint8)
     labels[10:20, 10:20], labels[30:40, 10:20] = 1, 2
-    path = save(tmp_path / "000003.png")
     palette, separate = tmp_path / "palette", tmp_path / "mask_visib"
     palette.mkdir(), separate.mkdir()
     image = Image.fromarray(labels)
@@ -195,11 +157,14 @@ def test_masks_are_the_indices_of_a_palette_and_binary_images_of_bop(tmp_path):
     for number in (1, 2):
         cv2.imwrite(str(separate / f"000003_00000{number - 1}.png"), 255 * (labels == number).astype(np.uint8))
     cv2.imwrite(str(separate / "000013_000000.png"), np.full((48, 64), 255, np.uint8))
-    for folder in (palette, separate):
+    cv2.imwrite(str(plain / "000003.png"), labels)
+    for folder in (plain, palette, separate):
         np.testing.assert_array_equal(read(path, NUMBERS, reading=Reading(masks=folder)).labels, labels)
     cv2.imwrite(str(separate / "000003_000002.png"), labels[1:])
-    with pytest.raises(FrameError, match="one size"):
-        read(path, NUMBERS, reading=Reading(masks=separate))
+    cv2.imwrite(str(plain / "000003.png"), labels[:-1])
+    for folder, said in ((separate, "one size"), (plain, "shape")):
+        with pytest.raises(FrameError, match=said):
+            read(path, NUMBERS, reading=Reading(masks=folder))
 
 
 def test_matrices_beside_frames_are_no_frames(tmp_path):
@@ -215,7 +180,7 @@ def npz(path, depth, **fields):
     return path
 
 
-MATRIX = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
+MATRIX = CAMERA.matrix
 
 
 @pytest.mark.parametrize(
@@ -262,24 +227,12 @@ def test_a_number_that_float32_does_not_hold_is_no_reading(tmp_path, name):
     assert np.all(frame.depth[1:] == 0.5)
 
 
-def test_a_colour_picture_is_named(tmp_path):
-    image = np.zeros((48, 64, 3), np.uint16)
-    image[..., 2] = 900
-    cv2.imwrite(str(tmp_path / "a.png"), image)
-    with pytest.raises(FrameError, match="the camera's picture, or depth drawn in colours"):
-        read(tmp_path / "a.png", NUMBERS)
-
-
-def test_an_empty_name_is_no_folder(tmp_path, monkeypatch):
+def test_a_broken_link_in_a_folder_is_reported_and_an_empty_name_is_no_folder(tmp_path, monkeypatch):
+    """As of a data set of which not all was fetched."""
     save(tmp_path / "a.png")
     monkeypatch.chdir(tmp_path)
     ((_, error),) = RecordedInput([""])
     assert "got an empty one" in str(error)
-
-
-def test_a_broken_link_in_a_folder_is_reported(tmp_path):
-    """As of a data set of which not all was fetched."""
-    save(tmp_path / "a.png")
     (tmp_path / "b.png").symlink_to(tmp_path / "elsewhere" / "b.png")
     (_, frame), (file, error) = RecordedInput([str(tmp_path)], InputOptions(NUMBERS))
     assert frame.camera == CAMERA
@@ -293,8 +246,8 @@ def test_a_folder_without_frames_gives_those_of_its_subfolders(tmp_path):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         save(tmp_path / name)
     for folder, focal in ((tmp_path, 60), (tmp_path / "take10", 70)):
-        as_json(folder / "camera_intrinsic.json",
-                {"width": 64, "height": 48, "intrinsic_matrix": [focal, 0, 0, 0, focal, 0, 31.5, 23.5, 1]})  # fmt: skip
+        known = {"width": 64, "height": 48, "intrinsic_matrix": [focal, 0, 0, 0, focal, 0, 31.5, 23.5, 1]}
+        (folder / "camera_intrinsic.json").write_text(json.dumps(known))
     found = list(RecordedInput([str(tmp_path)]))
     assert [file for file, _ in found] == [str(tmp_path / name) for name in ("take2/depth/a.png", "take10/b.png")]
     assert [frame.camera.fx for _, frame in found] == [60, 70]
@@ -309,21 +262,6 @@ def test_a_folder_of_names_that_are_times_gives_them_by_time(tmp_path):
     save(tmp_path / "5.1_b.png")
     found = list(RecordedInput([str(tmp_path)], InputOptions(NUMBERS)))
     assert [frame.name for _, frame in found][:4] == ["5.0.png", "5.1.png", "5.1_b.png", "5.05.png"]
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("cam_K.txt", "60 0 31.5\n0 61 23.5\n0 0 1\n"),
-        ("intrinsics.csv", "60,0,31.5,0\n0,61,23.5,0\n0,0,1,0\n0,0,0,1\n"),
-        ("camera.json", '{"fx": 60, "fy": 61, "cx": 31.5, "cy": 23.5, "depth_scale": 1.0}'),
-        ("scene.json", '{"cam_K": [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]}'),
-        ("camera.yaml", "fx: 60\nfy: 61\ncx: 31.5\ncy: 23.5\n"),
-    ],
-)
-def test_intrinsics_without_a_size_are_of_the_images(tmp_path, name, text):
-    (tmp_path / name).write_text(text)
-    assert read(save(tmp_path / "a.png"), tmp_path / name).camera == CAMERA
 
 
 def test_intrinsics_of_another_resolution_are_noticed(tmp_path):

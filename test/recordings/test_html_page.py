@@ -1,7 +1,5 @@
 """The page of `recover --html`: whole in one file, bodies where they are, and words that cannot leave their place."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re
@@ -10,12 +8,9 @@ import numpy as np
 import pytest
 from browser import executable, opened
 
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Camera, RecordedFrame, Recoverer, Superquadric
 from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
-from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recordings.html_page import HtmlPage
-from sq_perception.recovery.recoverer import Recoverer
 
 CAMERA = Camera(80, 60, 100.0, 100.0, 39.5, 29.5)
 BODY = Superquadric([0.05, 0.04, 0.08], [0.2, 0.9], [0.01, 0.02, 0.7], [0.4, 0.2, 0.1, 0.8])
@@ -71,7 +66,9 @@ def test_the_page_forbids_the_browser_to_load_anything(page):
     assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=", text)
 
 
-def test_a_covered_lens_is_a_frame_like_others(tmp_path):
+def test_a_covered_lens_is_a_frame_like_others_and_there_is_no_page_without_a_frame(tmp_path):
+    assert HtmlPage(tmp_path / "out.html").close() is None
+    assert not list(tmp_path.iterdir())
     depth = np.full((60, 80), np.nan, np.float32)
     page = HtmlPage(tmp_path / "out.html")
     page.add(RecordedFrame(depth, CAMERA, None, "dark"), Recoverer(method="symmetry").recover(depth, CAMERA))
@@ -79,12 +76,6 @@ def test_a_covered_lens_is_a_frame_like_others(tmp_path):
     (frame,) = frames(tmp_path / "out.html")
     assert (frame["rows"], frame["bodies"], frame["points"]["steps"]) == ([], [], "")
     assert frame["remark"]
-
-
-def test_no_page_without_a_frame(tmp_path):
-    page = HtmlPage(tmp_path / "out.html")
-    assert page.close() is None
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("room", [1000, 100_000])

@@ -1,7 +1,5 @@
 """What the cloud says of a body beside its parameters: how sure each of them is, and why a body is weak."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +8,9 @@ from std_msgs.msg import Header
 
 from sq_msgs_py import poses, superquadrics
 from sq_msgs_py.superquadrics import FAILED, WEAK, Reason
-from sq_perception.fitting.fit import Fit, Parts, Status
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Fit, FrameRecovery, Parts, Recovery, Status, Superquadric
 from sq_perception.recordings import publication
 from sq_perception.recovery.cavities import Cavity
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 from sq_perception.tracking.session import Followed
 
 BODY = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
@@ -78,18 +74,12 @@ def test_deviations_are_along_and_about_the_axes_of_the_body():
         np.testing.assert_array_equal(getattr(moved, column), getattr(shown, column))
 
 
-def test_what_a_method_does_not_know_is_not_claimed():
-    shown = array(publication.identify(recovery(Status.CONVERGED, np.full(11, np.nan))))
-    for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
-        assert np.isnan(getattr(shown, column)).all(), column
-
-
-@pytest.mark.parametrize("count", [0, 3])
-def test_the_truth_is_sure_of_everything(count):
-    bodies = Superquadric.stack([BODY] * count)
-    truth = publication.truth_array(bodies)
-    for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
-        assert not getattr(truth, column).any()
+def test_what_a_method_does_not_know_is_not_claimed_and_the_truth_is_sure_of_everything():
+    unknown = array(publication.identify(recovery(Status.CONVERGED, np.full(11, np.nan))))
+    for truth in (publication.truth_array(Superquadric.stack([BODY] * count)) for count in (0, 3)):
+        for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
+            assert np.isnan(getattr(unknown, column)).all(), column
+            assert not getattr(truth, column).any(), column
 
 
 PLACES = np.array([[0.0, 0.0, 0.6], [0.1, 0.0, 0.6]])
@@ -115,8 +105,7 @@ def test_parts_follow_the_objects_in_the_cloud_and_share_their_ids(is_tracked):
     found = publication.findings(publication.identify(frame, followed), Header(), is_cube=False)
     read = superquadrics.from_message(superquadrics.to_message(found.cloud, Header()))
     first, second = (31, 32) if is_tracked else (7, 9)
-    assert read.id.tolist() == [first, second, first, first]
-    assert read.part.tolist() == [0, 0, 1, 2]
+    assert (read.id.tolist(), read.part.tolist()) == ([first, second, first, first], [0, 0, 1, 2])
     assert read.label.tolist() == [7, 9, 7, 7]
     assert read.recovered.id.tolist() == found.shown_ids == [first, second]
     parts = read.parts_of(first)

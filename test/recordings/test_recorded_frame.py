@@ -1,7 +1,5 @@
 """Frames from files: what is read is what was recorded, and what cannot be read says why."""
 
-from __future__ import annotations
-
 import re
 
 import cv2
@@ -10,9 +8,8 @@ import pytest
 import yaml
 from PIL import Image
 
-from sq_perception.geometry.superquadric import Superquadric
+from sq_perception import Camera, Superquadric
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 from sq_perception.recordings.camera_file import FrameError, Region, read_calibration, read_camera_info
@@ -22,18 +19,12 @@ K = np.array([[60.0, 0, 31.5], [0, 61.0, 23.5], [0, 0, 1]])
 
 
 def camera_info(path, **changes):
-    info = {
-        "image_width": 64,
-        "image_height": 48,
-        "camera_name": "depth",
-        "camera_matrix": {"rows": 3, "cols": 3, "data": K.ravel().tolist()},
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
-        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
-        "projection_matrix": {"rows": 3, "cols": 4, "data": np.hstack([K, np.zeros((3, 1))]).ravel().tolist()},
-    }
-    info.update(changes)
-    path.write_text(yaml.safe_dump({name: value for name, value in info.items() if value is not None}))
+    info = {"image_width": 64, "image_height": 48, "camera_name": "depth", "distortion_model": "plumb_bob"}
+    info["camera_matrix"] = {"rows": 3, "cols": 3, "data": K.ravel().tolist()}
+    info["distortion_coefficients"] = {"rows": 1, "cols": 5, "data": [0.0] * 5}
+    info["rectification_matrix"] = {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()}
+    info["projection_matrix"] = {"rows": 3, "cols": 4, "data": (K @ np.eye(3, 4)).ravel().tolist()}
+    path.write_text(yaml.safe_dump({**info, **changes}))
     return path
 
 
@@ -54,11 +45,9 @@ def test_npz_with_labels(tmp_path):
     labels[10:20, 10:20] = 7
     frame = read(save_npz(tmp_path / "frame.npz", labels=labels))
     assert frame.camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
-    assert frame.depth.dtype == np.float32
-    assert frame.labels.dtype == np.int32
+    assert (frame.depth.dtype, frame.labels.dtype) == (np.float32, np.int32)
     assert np.isnan(frame.depth[0, :3]).all()
-    assert np.isfinite(frame.depth).sum() == 48 * 64 - 3
-    assert set(np.unique(frame.labels)) == {0, 7}
+    assert (np.isfinite(frame.depth).sum(), set(np.unique(frame.labels))) == (48 * 64 - 3, {0, 7})
     assert frame.name == "frame.npz"
     assert not frame.is_cube
 
@@ -111,9 +100,8 @@ def test_grey_images_are_views_of_the_cube(tmp_path, suffix):
     assert np.abs(frame.depth[seen] - depth[seen]).max() <= 0.5 / 255 + 1e-6
     fine = unit_cube.grey_from_depth(depth, np.uint16)
     cv2.imwrite(str(tmp_path / "fine.png"), fine)
-    np.testing.assert_allclose(
-        read(tmp_path / "fine.png", projection="orthographic").depth[seen], depth[seen], atol=1 / 65535
-    )
+    found = read(tmp_path / "fine.png", projection="orthographic").depth
+    np.testing.assert_allclose(found[seen], depth[seen], atol=1 / 65535)
 
 
 def test_grey_saved_as_colour_is_accepted_and_colour_is_not(tmp_path):
@@ -125,6 +113,9 @@ def test_grey_saved_as_colour_is_accepted_and_colour_is_not(tmp_path):
     cv2.imwrite(str(tmp_path / "colour.png"), grey)
     with pytest.raises(FrameError, match="colour"):
         read(tmp_path / "colour.png", projection="orthographic")
+    cv2.imwrite(str(tmp_path / "wide.png"), np.uint16([[[0, 0, 900]]]))
+    with pytest.raises(FrameError, match="the camera's picture, or depth drawn in colours"):
+        read(tmp_path / "wide.png", "60,61,0,0")
 
 
 BAD_NPZ = {
@@ -211,34 +202,6 @@ def test_names_that_no_file_can_have_are_named(tmp_path):
         read(tmp_path / "depth.txt")
     with pytest.raises(ValueError, match="projection"):
         read(tmp_path / "eight.png", projection="fisheye")
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("", "mapping"),
-        ("[1, 2", "four numbers"),
-        ("{1, 2", "not YAML"),
-        ("just text", "mapping"),
-        ("!!python/object/apply:os.system ['true']", "not YAML"),
-        ("{image_width: 64, k: [9, 0, 0, 0, 9, 0, 0, 0, 1]}", "image_height"),
-        ("{image_width: wide, image_height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1]}", "positive integer"),
-        ("{image_width: 64, image_height: 48}", "camera_matrix"),
-        ("{image_width: 64, image_height: 48, k: [1, 2]}", "4 or 9 or 12 or 16 finite numbers"),
-        ("{image_width: 64, image_height: 48, k: [a, b]}", "expected numbers"),
-        ("{width: 64, height: 48, k: [0, 0, 0, 0, 0, 0, 0, 0, 0]}", "above 0"),
-        ("{width: 64, height: 48, k: [9, 1, 0, 0, 9, 0, 0, 0, 1]}", "no skew"),
-        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], binning_x: -1}", "binning_x"),
-        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: {x_offset: a}}", "x_offset"),
-        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: 3}", "roi"),
-        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], d: [.nan]}", "finite"),
-    ],
-)
-def test_bad_camera_infos_are_named(tmp_path, text, reason):
-    path = tmp_path / "info.yaml"
-    path.write_text(text)
-    with pytest.raises(FrameError, match=reason):
-        read_calibration(path)
 
 
 def test_shared_recordings_are_read(shared_data):

@@ -1,7 +1,5 @@
 """JSON lines: whole lines only, resumed where they end, and nothing of anybody else's is touched."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json
@@ -61,17 +59,13 @@ def test_what_is_not_ours_is_refused_and_stays(tmp_path, content):
     assert path.read_text() == content
 
 
-def test_other_options_are_refused_by_name(path):
-    before = path.read_bytes()
+def test_other_options_are_refused_by_name_unless_there_is_no_frame_yet(path):
+    """As of a run whose model turned out to be damaged; a document in one line is no such file."""
+    before, other = path.read_bytes(), {**OPTIONS, "method": "network"}
     with pytest.raises(ResumeError, match="method was auto, is network"):
-        ResultLines(path, {**OPTIONS, "method": "network"})
+        ResultLines(path, other)
     assert path.read_bytes() == before
-
-
-def test_a_file_without_a_frame_takes_other_options(path):
-    """Of a run whose model turned out to be damaged, say; a document in one line is none."""
     head = path.read_text().splitlines()[0]
-    other = {**OPTIONS, "method": "network"}
     path.write_text(head + "\n")
     ResultLines(path, other).close()
     assert json.loads(path.read_text())["options"] == other

@@ -1,7 +1,5 @@
 """Scenes for planners, read again: by MuJoCo, by a strict parse of XML, and as cuRobo reads its worlds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from xml.etree import ElementTree as Xml
 

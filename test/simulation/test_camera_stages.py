@@ -1,7 +1,5 @@
 """Each stage of a camera does what its equation says; planes stay planes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

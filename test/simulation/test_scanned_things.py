@@ -1,19 +1,15 @@
 """Things of one's own: a mesh is seen as the body that it is made of, rests on its faces, and tells its hull."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from sq_perception import Camera, Superquadric, mesh
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.mesh import mesh
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS
-from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging import canonical_view, raycast
 from sq_perception.learning.shard_training import THINGS, read_views, write_views
 from sq_perception.simulation.rendering import Mesh, render_mesh
 from sq_perception.simulation.thing import read_things
@@ -93,9 +89,7 @@ def test_views_of_a_mesh_tell_its_hull(folder: Path) -> None:
         assert (truth - reach).min() < 0.005
 
 
-def test_half_of_the_views_show_ones_own_things(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_half_of_the_views_show_ones_own_things(folder, tmp_path, capsys) -> None:
     own = read_things(folder)
     write_views(tmp_path / "views", range(1), lambda rng: draw_thing_views(40, rng, own=own), 5)
     views = read_views(THINGS.none, [tmp_path / "views" / "00000.safetensors"])
@@ -117,8 +111,6 @@ def test_a_long_thing_is_wholly_before_the_camera(tmp_path: Path) -> None:
 
 
 def test_support_in_a_view_is_that_of_the_corners(folder: Path) -> None:
-    from sq_perception.imaging import canonical_view
-
     (thing,) = read_things(folder)
     setting = draw_setting(thing, np.random.default_rng(8))
     depth, seen = setting.render()
@@ -139,6 +131,10 @@ def test_what_is_no_thing_is_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
     with pytest.raises(ValueError, match="no mesh with a volume"):
         read_things(tmp_path)
+    sheet = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0.0]])
+    trimesh.Trimesh(sheet, [[0, 1, 2], [0, 2, 3]], process=False).export(tmp_path / "broken.ply")
+    with pytest.raises(ValueError, match=r"broken\.ply: no mesh with a volume"):
+        read_things(tmp_path)
 
 
 @pytest.mark.parametrize("sides", [32, 300])
@@ -149,19 +145,10 @@ def test_a_round_thing_lies_as_often_however_finely_it_is_divided(tmp_path: Path
     assert standing == pytest.approx(0.071, abs=0.02)
 
 
-def test_points_of_no_face_are_no_part_of_a_thing(folder: Path) -> None:
+def test_points_of_no_face_are_no_part_of_a_thing_and_hidden_files_are_none(folder: Path) -> None:
+    (folder / "._crate.ply").write_bytes(b"of a file system")
     box = trimesh.creation.box(EDGES)
     stray = trimesh.Trimesh(np.concatenate([box.vertices, [[0.5, 0.5, 0.5]]]), box.faces, process=False)
     stray.export(folder / "crate.ply")
     (thing,) = read_things(folder)
-    low, high = thing.box
-    np.testing.assert_allclose(high - low, EDGES, atol=1e-4)
-
-
-def test_a_flat_sheet_is_refused_and_hidden_files_are_passed_over(tmp_path: Path, folder: Path) -> None:
-    (folder / "._crate.ply").write_bytes(b"of a file system")
-    assert len(read_things(folder)) == 1
-    vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0.0]])
-    trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], process=False).export(folder / "sheet.ply")
-    with pytest.raises(ValueError, match=r"sheet\.ply: no mesh with a volume"):
-        read_things(folder)
+    np.testing.assert_allclose(thing.box[1] - thing.box[0], EDGES, atol=1e-4)

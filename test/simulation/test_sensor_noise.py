@@ -1,7 +1,5 @@
 """Sensors: what they claim is what they do, their geometry is that of two eyes, and recorded planes agree."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -38,9 +36,6 @@ def runs(row: np.ndarray) -> list[tuple[int, int]]:
     """First and last index of every run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], row.view(np.int8), [0]])))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
-
-
-# The claim: sigma, steps, bias
 
 
 @pytest.mark.parametrize("angle", [0.0, 45.0, 55.0])
@@ -106,9 +101,6 @@ def test_noise_of_triangulation_is_shared_within_the_window(rng):
     assert found == pytest.approx(1 - 2 / rows, abs=0.06)
 
 
-# Edges
-
-
 @pytest.mark.parametrize("baseline", [0.075, -0.075])
 def test_shadows_lie_on_the_side_away_from_the_projector_and_have_its_width(baseline, rng):
     model = dataclasses.replace(STILL, baseline=baseline)
@@ -162,8 +154,7 @@ def test_edges_wander_by_the_stated_pixels(wander, rng):
     expected = norm.cdf((199.5 - np.arange(192, 208)) / wander)
     reached = np.abs(np.arange(192, 208) - 199.5) < 4
     np.testing.assert_allclose(near[reached], expected[reached], atol=0.03)
-    assert near[0] == 1
-    assert near[-1] == 0
+    assert (near[0], near[-1]) == (1, 0)
 
 
 def test_edges_wander_without_moving_surfaces(rng):
@@ -199,9 +190,6 @@ def test_the_nearer_surface_returns_more_light(rng):
     expected = (share * 1.0 + (1 - share) * 0.5) / (share * 1.0 + (1 - share) * 0.25)
     assert np.mean(far) == pytest.approx(np.mean(expected), abs=0.01)
     assert far.min() > (0.5 + 0.25) / (0.5 + 0.125) - 6 * model.sigma(2.0)
-
-
-# Holes
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -243,9 +231,6 @@ def test_nothing_stays_nothing_and_readings_keep_the_range(name, rng):
         assert np.isnan(model.measure(np.full((240, 320), outside), CAMERA, rng)).all()
 
 
-# All of it
-
-
 @pytest.mark.parametrize("name", ["ideal", *NAMES])
 def test_a_seed_names_an_image_and_the_truth_is_left_alone(name):
     model = Ideal(0.002) if name == "ideal" else preset(name)
@@ -255,8 +240,7 @@ def test_a_seed_names_an_image_and_the_truth_is_left_alone(name):
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, other, equal_nan=True)
     np.testing.assert_array_equal(true, kept)
-    assert first.dtype == np.float32
-    assert first.shape == true.shape
+    assert (first.dtype, first.shape) == (np.float32, true.shape)
     np.testing.assert_array_equal(model.measure(true.astype(float), CAMERA, np.random.default_rng(1)), first)
 
 

@@ -1,19 +1,23 @@
-"""Views of things: what the code for images makes of them, poses on the table, and the truth that comes with them."""
+"""Views of things and of segments to train on: what images make of them, poses on the table, and their truth."""
 
-from __future__ import annotations
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from sq_perception import Camera, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS, mirrored, support_of_union
 from sq_perception.imaging import canonical_view
-from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import COVERED, FLUSH, HIDDEN, NEAREST
 from sq_perception.imaging.raycast import render
+from sq_perception.imaging.segment_view import IMAGE, MEASURED, SEGMENT
+from sq_perception.segmentation.evidence import FrameEvidence
+from sq_perception.simulation import segment_views
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.rendering import render_things
+from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 from sq_perception.simulation.thing_views import draw_sensor, draw_thing_views, support_in_view
 
@@ -27,10 +31,8 @@ def alone(setting: Setting, camera: Camera | None = None) -> Setting:
 
 def finer(camera: Camera, times: int) -> Camera:
     """The same image with more pixels: centres are those of the pixels' middles."""
-    return Camera(
-        camera.width * times, camera.height * times, camera.fx * times, camera.fy * times,
-        (camera.cx + 0.5) * times - 0.5, (camera.cy + 0.5) * times - 0.5,
-    )
+    width, height, fx, fy = (times * each for each in (camera.width, camera.height, camera.fx, camera.fy))
+    return Camera(width, height, fx, fy, (camera.cx + 0.5) * times - 0.5, (camera.cy + 0.5) * times - 0.5)
 
 
 def flipped(bodies: Superquadric) -> Superquadric:
@@ -160,8 +162,7 @@ def test_one_sees_into_a_cup() -> None:
     closed, _ = render_things(body, np.zeros(1), NOTHING, np.zeros(0), camera)
     opened, thing = render_things(body, np.zeros(1), hole, np.zeros(1), camera, behind=2.0)
     assert closed[40, 40] == pytest.approx(0.45)
-    assert opened[40, 40] == pytest.approx(0.54)
-    assert opened[40, 15] == pytest.approx(closed[40, 15])
+    assert (opened[40, 40], opened[40, 15]) == (pytest.approx(0.54), pytest.approx(closed[40, 15]))
     assert thing[40, 15] == 0
     assert opened[0, 0] == 2.0
     assert thing[0, 0] == -1
@@ -198,13 +199,9 @@ def test_pixels_without_a_reading_are_hidden_where_asked_for(columns: int) -> No
     assert not (marked.hidden & (marked.image > 0)).any()
     # What the image does not show at all.
     window = np.s_[:, left + 3 :]
-    cut = canonical_view.from_mask(
-        depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60), missing_is_hidden=True
-    )
-    assert cut.hidden[:, 0].all()
-    assert not canonical_view.from_mask(
-        depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60)
-    ).hidden.any()
+    shown = depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60)
+    assert canonical_view.from_mask(*shown, missing_is_hidden=True).hidden[:, 0].all()
+    assert not canonical_view.from_mask(*shown).hidden.any()
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])
@@ -282,3 +279,51 @@ def test_what_is_around_a_thing_does_not_go_through_itself() -> None:
                     assert other.gauge(points).min() > 0.97
                     pairs += 1
     assert pairs > 20
+
+
+@pytest.fixture(scope="module")
+def drawn() -> SegmentViews:
+    return draw_segment_views(10, np.random.default_rng(4))
+
+
+def test_truth_is_known_where_something_was_measured(drawn: SegmentViews) -> None:
+    assert len(drawn.images) == len(drawn.truth) > 10
+    np.testing.assert_array_equal(drawn.truth == UNKNOWN, drawn.images[..., MEASURED] == 0)
+
+
+def test_most_of_a_segment_is_its_object(drawn: SegmentViews) -> None:
+    inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
+    own = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
+    assert np.median(own) > 0.85
+    assert (drawn.truth[inside] == NO).any()
+
+
+def test_borders_cut_some(drawn: SegmentViews) -> None:
+    """Cells outside of the image beside cells of the segment."""
+    outside = drawn.images[..., IMAGE] == 0
+    beside = (outside[:, 1:] & (drawn.images[:, :-1, :, SEGMENT] > 0)) | (
+        outside[:, :-1] & (drawn.images[:, 1:, :, SEGMENT] > 0)
+    )
+    assert 0 < np.count_nonzero(beside.any(axis=(1, 2))) < len(drawn.images)
+
+
+def test_scenes_without_segments_give_an_empty_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = FrameEvidence(np.zeros((1, 1), np.int32))
+    monkeypatch.setattr(segment_views.segments, "segment", lambda *_: nothing)
+    assert draw_segment_views(1, np.random.default_rng(1)).truth.shape == (0, 64, 64)
+
+
+def test_pieces_of_merged_things_show_one_thing_each_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = segment_views.segments.segment
+
+    def merged(*image: Any) -> FrameEvidence:
+        found = find(*image)
+        return replace(found, labels=(found.labels > 0).astype(np.int32), ids=(1,) if found.ids else ())
+
+    monkeypatch.setattr(segment_views.segments, "segment", merged)
+    scenes = 3
+    drawn = draw_segment_views(scenes, np.random.default_rng(2))
+    inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
+    pure = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
+    assert np.count_nonzero((pure > 0) & (pure < 0.7)) <= scenes
+    assert np.count_nonzero(pure >= 0.7) > 2 * scenes

@@ -1,7 +1,5 @@
 """Images by hand, byte by byte, against what the module reads and writes."""
 
-from __future__ import annotations
-
 import struct
 from typing import Any
 
@@ -18,28 +16,23 @@ from sq_msgs_py import depth_image
 from sq_msgs_py.depth_image import ImageError, Intrinsics
 from sq_perception.recordings import publication
 
+HEADER = Header(stamp=Time(sec=12, nanosec=345), frame_id="camera_optical")
+
 
 def depth_from_message(message: Image) -> np.ndarray:
     return publication.depth_of(message, is_cube=False)[0].depth
 
 
-HEADER = Header(stamp=Time(sec=12, nanosec=345), frame_id="camera_optical")
-
-
 def image(encoding: str, width: int, height: int, data: bytes, *, step: int, big: bool = False) -> Image:
-    message = Image(header=HEADER, encoding=encoding, width=width, height=height, step=step, is_bigendian=int(big))
-    message.data = data
-    return message
+    fields = {"header": HEADER, "encoding": encoding, "width": width, "height": height, "step": step}
+    return Image(**fields, is_bigendian=int(big), data=data)
 
 
-def test_millimetres_become_metres_and_zero_becomes_nan() -> None:
+def test_millimetres_become_metres_which_keep_their_value_and_what_is_no_reading_becomes_nan() -> None:
     message = image("16UC1", 3, 2, struct.pack("<6H", 0, 1, 1000, 1500, 65534, 2), step=6)
     depth = depth_from_message(message)
     assert depth.dtype == np.float32
     np.testing.assert_array_equal(depth, np.float32([[np.nan, 0.001, 1.0], [1.5, 65.534, 0.002]]))
-
-
-def test_metres_keep_their_value_and_what_is_no_reading_becomes_nan() -> None:
     message = image("32FC1", 3, 2, struct.pack("<6f", 0.5, np.nan, np.inf, -np.inf, 0.0, -1.0), step=12)
     np.testing.assert_array_equal(depth_from_message(message), [[0.5, np.nan, np.nan], [np.nan] * 3])
 
@@ -57,17 +50,11 @@ def test_rows_may_be_padded_and_bytes_swapped(encoding: str, code: str, padding:
     assert depth.dtype.isnative
 
 
-def test_pixels_are_read_in_place() -> None:
+def test_pixels_are_read_in_place_and_a_depth_image_does_not_change_with_its_message() -> None:
     message = depth_image.depth_to_message(np.ones((4, 5), np.float32), HEADER)
-    pixels = depth_image.pixels_from_message(message)
+    pixels, depth = depth_image.pixels_from_message(message), depth_from_message(message)
     message.data[0:4] = message.data[0:0].__class__("B", struct.pack("<f", 7.0))
     assert pixels[0, 0] == 7.0
-
-
-def test_a_depth_image_does_not_change_with_its_message() -> None:
-    message = depth_image.depth_to_message(np.ones((4, 5), np.float32), HEADER)
-    depth = depth_from_message(message)
-    message.data[0] = 99
     assert (depth == 1).all()
     depth[:] = 2
     assert depth_from_message(message)[1, 1] == 1
@@ -166,32 +153,10 @@ def test_intrinsics_survive_the_round_trip() -> None:
     assert depth_image.intrinsics_from_message(message) == intrinsics
 
 
-def test_k_counts_where_p_is_not_set() -> None:
-    message = CameraInfo(width=4, height=3, k=[5.0, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0])
-    assert depth_image.intrinsics_from_message(message) == Intrinsics(4, 3, 5.0, 6.0, 2.0, 1.0)
-
-
-def test_a_cut_out_and_binned_image_sees_the_same_ray() -> None:
-    """Full-resolution pixel (u, v) is ((u - x_offset) / binning, ...) in the image; its ray must not change."""
-    full = Intrinsics(640, 480, 500.0, 510.0, 320.0, 240.0)
-    message = depth_image.intrinsics_to_message(full, HEADER)
-    message.roi.x_offset, message.roi.y_offset, message.roi.width, message.roi.height = 100, 40, 300, 200
-    message.binning_x = message.binning_y = 2
-    part = depth_image.intrinsics_from_message(message)
-    assert (part.width, part.height) == (150, 100)
-    u, v = 250.0, 130.0
-    inner_u, inner_v = (u - 100) / 2, (v - 40) / 2
-    assert (inner_u - part.cx) / part.fx == pytest.approx((u - full.cx) / full.fx)
-    assert (inner_v - part.cy) / part.fy == pytest.approx((v - full.cy) / full.fy)
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
         ({}, "not calibrated"),
-        ({"k": [-5.0, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "above 0"),
-        ({"k": [np.nan, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "finite"),
-        ({"k": [5.0, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0], "width": 0}, "at least 1 x 1"),
         ({"k": [1e-9, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "0.01 to 1e\\+06 pixels"),
         ({"k": [5.0, 0.0, 2.0, 0.0, 1e300, 1.0, 0.0, 0.0, 1.0]}, "0.01 to 1e\\+06 pixels"),
         ({"k": [5.0, 0.0, -1e20, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "principal point"),

@@ -1,7 +1,5 @@
 """moveit_msgs/Grasp of grasps, with classes built by hand: poses of the link, approaches, what may be touched."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """Superquadrics as other stacks take them: frames, detections, collision objects, and arrays in other frames."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -16,11 +14,10 @@ from std_msgs.msg import Header
 
 from sq_msgs_py import poses
 from sq_msgs_py.collision_objects import Scene, collision_objects, planning_scene, removals
-from sq_msgs_py.poses import body_name, detections, transforms
+from sq_msgs_py.poses import detections, transforms
 from sq_msgs_py.superquadrics import CONVERGED, FAILED, WEAK, SuperquadricArray
+from sq_perception import Superquadric, mesh
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.mesh import mesh
-from sq_perception.geometry.superquadric import Superquadric
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
 QUARTER_ABOUT_Z = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
@@ -46,16 +43,6 @@ def three() -> SuperquadricArray:
 def numbers(pose: Any) -> tuple[list[float], list[float]]:
     p, q = pose.position, pose.orientation
     return [p.x, p.y, p.z], [q.x, q.y, q.z, q.w]
-
-
-# Frames
-
-
-def test_recovered_bodies_keep_their_order():
-    kept = three().recovered
-    assert kept.id.tolist() == [4, 6]
-    assert kept.shape[1].tolist() == pytest.approx([0.1, 1.0])
-    assert len(SuperquadricArray.empty().recovered) == 0
 
 
 def test_moving_an_array_is_moving_its_bodies():
@@ -106,9 +93,6 @@ def test_what_is_no_motion_is_refused(rotation, translation):
         poses.move(three(), np.array(rotation), np.array(translation))
 
 
-# Transforms
-
-
 def test_frames_of_bodies_that_did_not_fail():
     first, second = transforms(three(), HEADER)
     assert (first.child_frame_id, second.child_frame_id) == ("superquadric_4", "superquadric_6")
@@ -120,11 +104,9 @@ def test_frames_of_bodies_that_did_not_fail():
     assert [turn.x, turn.y, turn.z, turn.w] == [0.0, 1.0, 0.0, 0.0], "of length 1, as tf2 asks for"
     assert transforms(three(), HEADER, prefix="left/")[0].child_frame_id == "left/4"
     assert transforms(SuperquadricArray.empty(), HEADER) == []
+    assert len(SuperquadricArray.empty().recovered) == 0
     with pytest.raises(ValueError, match="frame_id"):
         transforms(three(), Header())
-
-
-# Detections
 
 
 def test_detections_say_full_sizes_scores_and_names():
@@ -153,16 +135,11 @@ def test_detections_carry_the_covariances_that_are_known():
         detections(three(), HEADER, covariances=known[:2])
 
 
-# Collision objects
-
-
 def test_collision_objects_of_primitives():
     box, can = collision_objects(three(), HEADER)
     assert (box.id, can.id) == ("superquadric_4", "superquadric_6")
-    assert box.operation == type(box).ADD
-    assert box.header == HEADER
-    assert numbers(box.pose)[0] == [1.0, 2.0, 3.0]
-    assert numbers(box.pose)[1] == pytest.approx([0, 0, 0.6, 0.8])
+    assert (box.operation, box.header) == (type(box).ADD, HEADER)
+    assert (numbers(box.pose)[0], numbers(box.pose)[1]) == ([1.0, 2.0, 3.0], pytest.approx([0, 0, 0.6, 0.8]))
     assert [list(one.dimensions) for one in box.primitives] == [pytest.approx([0.10, 0.08, 0.06])]
     assert [list(one.dimensions) for one in can.primitives] == [pytest.approx([0.12, 0.03])]
     assert numbers(can.primitive_poses[0]) == ([0, 0, 0], [0, 0, 0, 1])
@@ -197,9 +174,7 @@ def test_scenes_are_differences_and_removals_never_mean_everything():
     scene = planning_scene(objects)
     assert scene.is_diff
     assert scene.robot_state.is_diff, "otherwise MoveIt takes the empty robot state for the robot's"
-    assert [one.id for one in scene.world.collision_objects] == [
-        *("superquadric_4", "superquadric_6", "superquadric_2", "superquadric_9")
-    ]
+    assert [one.id for one in scene.world.collision_objects] == [f"superquadric_{k}" for k in (4, 6, 2, 9)]
     gone = scene.world.collision_objects[-1]
     assert (gone.operation, gone.header) == (type(gone).REMOVE, HEADER)
     assert not len(gone.primitives)
@@ -229,11 +204,6 @@ def test_a_round_body_at_rest_is_sent_once():
     assert len(scene.changes(box, HEADER)) == 1
     swapped = replace(box, size=box.size[:, [1, 0, 2]], rotation=poses.product(box.rotation, QUARTER_ABOUT_Z))
     assert scene.changes(swapped, HEADER) == [], "a quarter turn of a box whose edges swap is the same box"
-
-
-def test_names():
-    assert body_name(np.uint32(7)) == "superquadric_7"
-    assert body_name(7, "left_") == "left_7"
 
 
 @pytest.mark.parametrize(("package", "make"), [("vision_msgs", detections), ("moveit_msgs", collision_objects)])

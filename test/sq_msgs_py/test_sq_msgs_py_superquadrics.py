@@ -1,13 +1,15 @@
-"""Superquadric clouds and markers: the layout as published, read by hand, and what is refused."""
-
-from __future__ import annotations
+"""Clouds of superquadrics and of points, and markers: the layout as published, read by hand, and what is refused."""
 
 import array
 import struct
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+
+from sq_msgs_py.columns import points_from_message
+from sq_msgs_py.superquadrics import MessageError
 
 pytest.importorskip("sensor_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
 
@@ -19,7 +21,7 @@ from visualization_msgs.msg import Marker
 
 from sq_msgs_py import superquadrics
 from sq_msgs_py.markers import PALETTE, markers
-from sq_msgs_py.superquadrics import FIELDS, MessageError, Reason, SuperquadricArray
+from sq_msgs_py.superquadrics import FIELDS, Reason, SuperquadricArray
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
 BEFORE = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
@@ -53,9 +55,8 @@ def test_one_body_reads_by_hand() -> None:
         part=np.array([2]),
     )
     message = superquadrics.to_message(body, HEADER)
-    assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
-        HEADER, 1, 1, 140, 140,
-    )
+    assert (message.header, message.height, message.width) == (HEADER, 1, 1)
+    assert (message.point_step, message.row_step) == (140, 140)
     numbers = struct.unpack("<17f6I11fI", message.data.tobytes())
     before = (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
     assert numbers == (*before, 12, 3, 1, 4 + 8, 0.25, 0.5, 1.5, 2.5, 3.5, 0.5, 0.25, 0.125, 0.5, -0.25, 0.875, 2)
@@ -101,22 +102,17 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
     """A message as another writer might lay it out: big endian, doubles, other order, a field more, two padded rows."""
     bodies = random_bodies(4, rng)
     names = [name for name, _ in FIELDS][::-1]
-    layout = np.dtype({
-        "names": ["extra", *names],
-        "formats": [">f4"] + [">u4" if name in ("id", "status", *COUNTS) else ">f8" for name in names],
-        "offsets": [0] + [4 + 9 * k for k in range(len(names))],
-        "itemsize": 400,
-    })  # fmt: skip
+    formats = [">f4"] + [">u4" if name in ("id", "status", *COUNTS) else ">f8" for name in names]
+    offsets = [0] + [4 + 9 * k for k in range(len(names))]
+    layout = np.dtype({"names": ["extra", *names], "formats": formats, "offsets": offsets, "itemsize": 400})
     points = np.zeros(4, layout)
-    flat = np.column_stack([bodies.translation, bodies.rotation, bodies.size, bodies.shape, bodies.score,
-                            bodies.residual, bodies.sigma_size])  # fmt: skip
-    for k, (name, _) in enumerate(FIELDS[:17]):
-        points[name] = flat[:, k]
+    order = ("translation", "rotation", "size", "shape", "score", "residual", "sigma_size")
+    for columns, part in ((order, FIELDS[:17]), ((*DEVIATIONS, "taper", "objectness"), FIELDS[-12:-1])):
+        numbers = np.column_stack([getattr(bodies, name) for name in columns])
+        for k, (name, _) in enumerate(part):
+            points[name] = numbers[:, k]
     for name in ("id", "status", *COUNTS):
         points[name] = getattr(bodies, name)
-    more = np.column_stack([getattr(bodies, name) for name in (*DEVIATIONS, "taper", "objectness")])
-    for k, (name, _) in enumerate(FIELDS[-12:-1]):
-        points[name] = more[:, k]
     message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=400, row_step=805)
     for name in layout.names:
         kind = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64, "u4": PointField.UINT32}[layout[name].str[1:]]
@@ -127,43 +123,25 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
         np.testing.assert_array_equal(getattr(after, column), getattr(bodies, column))
 
 
-def broken(change: str, rng: np.random.Generator) -> PointCloud2:
-    message = superquadrics.to_message(random_bodies(3, rng), HEADER)
-    if change == "no exponent":
-        message.fields = [field for field in message.fields if field.name != "e1"]
-    elif change == "no field":
-        message.fields = []
-    elif change == "two in one":
-        message.fields[3].count = 2
-    elif change == "unknown type":
-        message.fields[3].datatype = 77
-    elif change == "outside":
-        message.fields[5].offset = 138
-    elif change == "cut":
-        message.data = message.data[:-1]
-    elif change == "short row":
-        message.row_step = 100
-    elif change == "nan":
-        message.data[0:4] = array.array("B", struct.pack("<f", np.nan))
-    return message
-
-
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("broken", "words"),
     [
-        ("no exponent", "missing: e1"),
-        ("no field", "missing: x y z"),
-        ("two in one", "field qx: expected one number"),
-        ("unknown type", "field qx: expected one number, got datatype 77"),
-        ("outside", "field qz: offset 138 lies outside a point of 140 bytes"),
-        ("cut", "420 bytes, got 419"),
-        ("short row", "at least 420 bytes, got 100"),
-        ("nan", "translation: expected finite"),
+        (lambda cloud: {"fields": [field for field in cloud.fields if field.name != "e1"]}, "missing: e1"),
+        (lambda cloud: {"fields": []}, "missing: x y z"),
+        (lambda cloud: setattr(cloud.fields[3], "count", 2), "field qx: expected one number"),
+        (lambda cloud: setattr(cloud.fields[3], "datatype", 77), "field qx: expected one number, got datatype 77"),
+        (lambda cloud: setattr(cloud.fields[5], "offset", 138), "qz: offset 138 lies outside a point of 140 bytes"),
+        (lambda cloud: {"data": cloud.data[:-1]}, "420 bytes, got 419"),
+        (lambda cloud: {"row_step": 100}, "at least 420 bytes, got 100"),
+        (lambda cloud: {"data": struct.pack("<f", np.nan) + cloud.data[4:].tobytes()}, "translation: expected finite"),
     ],
 )
-def test_other_clouds_are_refused_with_the_reason(change: str, words: str, rng: np.random.Generator) -> None:
+def test_other_clouds_are_refused_with_the_reason(broken, words, rng) -> None:
+    message = superquadrics.to_message(random_bodies(3, rng), HEADER)
+    for name, value in (broken(message) or {}).items():
+        setattr(message, name, value)
     with pytest.raises(MessageError, match=words):
-        superquadrics.from_message(broken(change, rng))
+        superquadrics.from_message(message)
 
 
 @pytest.mark.parametrize(
@@ -194,12 +172,8 @@ def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
     message = markers([TETRAHEDRON], [5], HEADER, namespace="body", alpha=0.5)
     before, surface, outline = message.markers
     assert before.action == Marker.DELETEALL
-    assert (surface.ns, surface.id, surface.type, surface.action) == (
-        "body/surface",
-        5,
-        Marker.TRIANGLE_LIST,
-        Marker.ADD,
-    )
+    assert (surface.ns, surface.id, surface.type) == ("body/surface", 5, Marker.TRIANGLE_LIST)
+    assert surface.action == Marker.ADD
     points = np.array([[point.x, point.y, point.z] for point in surface.points])
     np.testing.assert_array_equal(points, TETRAHEDRON[0][TETRAHEDRON[1].reshape(-1)])
     assert (outline.ns, outline.id, outline.type) == ("body/outline", 5, Marker.LINE_LIST)
@@ -209,8 +183,7 @@ def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
     assert surface.color.a == 0.5
     assert np.float32([surface.color.r, surface.color.g, surface.color.b]) == pytest.approx(np.float32(PALETTE[5]))
     for marker in (surface, outline):
-        assert marker.header == HEADER
-        assert marker.pose.orientation.w == 1.0
+        assert (marker.header, marker.pose.orientation.w) == (HEADER, 1.0)
         assert marker.color.a > 0
 
 
@@ -230,3 +203,39 @@ def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
 def test_meshes_that_do_not_fit_are_refused(meshes: list, ids: list[int], options: dict) -> None:
     with pytest.raises(ValueError, match="expected"):
         markers(meshes, ids, HEADER, **options)
+
+
+POINTS = np.arange(24, dtype=float).reshape(2, 4, 3)
+KINDS = {"f4": 7, "f8": 8, "i2": 3}
+
+
+def message(kind: str = "f4", order: str = "<", names: str = "zyx", padding: int = 0) -> Any:
+    size = np.dtype(kind).itemsize
+    step, offsets = 3 * size + padding, {name: k * size for k, name in enumerate(names)}
+    layout = {"names": [*names], "formats": [order + kind] * 3, "offsets": [*offsets.values()], "itemsize": step}
+    rows = np.zeros((2, 4 + padding), np.dtype(layout))
+    for name in names:
+        rows[name][:, :4] = POINTS[..., "xyz".index(name)]
+    fields = [SimpleNamespace(name=name, offset=at, datatype=KINDS[kind], count=1) for name, at in offsets.items()]
+    steps = {"point_step": step, "row_step": step * (4 + padding)}
+    return SimpleNamespace(height=2, width=4, fields=fields, is_bigendian=order == ">", data=rows.tobytes(), **steps)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("names", "padding"), [("xyz", 0), ("zyx", 5)])
+def test_points_are_read_whatever_their_layout(kind, order, names, padding):
+    np.testing.assert_array_equal(points_from_message(message(kind, order, names, padding)), POINTS)
+
+
+def test_clouds_without_points_and_points_that_no_camera_measures() -> None:
+    empty = message()
+    vars(empty).update(height=0, data=b"")
+    assert points_from_message(empty).shape == (0, 4, 3)
+    vars(empty).update(width=0, point_step=2**32 - 1, row_step=0)
+    assert points_from_message(empty).shape == (0, 0, 3), "the step of no point may be any number"
+    with pytest.raises(MessageError, match="row_step"):
+        points_from_message(SimpleNamespace(**{**vars(message()), "row_step": 3}))
+    far = message("f8")
+    far.data = np.full(len(far.data) // 8, 1e300).tobytes()
+    assert np.isinf(points_from_message(far)).all()

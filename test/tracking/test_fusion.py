@@ -1,7 +1,5 @@
 """Fusion of views: one form that lasts, sizes that sharpen, and deviations that are true."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.stats import chi2
@@ -76,9 +74,6 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
         turn = quaternions.geodesic_angle(states[:, 8:12], truth.rotation)
         assert (turn[: association.EXACT] < 1e-6).all()
         assert (turn[association.EXACT :] < 1e-6).all() == allowed
-
-
-# Honest numbers
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
@@ -299,22 +294,15 @@ def test_a_hidden_pose_is_forgotten_once_at_any_frame_rate(rate, rng):
     np.testing.assert_allclose(np.sqrt(np.diag(track.covariance)[5:]), 1.0, rtol=0.01)
 
 
-def test_exact_bodies_are_fused_to_themselves():
+def test_exact_bodies_are_fused_to_themselves_and_unknown_covariances_have_a_default():
     truth, tracker = body(), Tracker()
+    (unknown,) = Tracker().update([Seen(truth, np.full((11, 11), np.nan))], 0.0)
+    np.testing.assert_allclose(unknown.sigma_size / truth.size, np.hypot(0.15, 0.01), rtol=1e-9)
     for k in range(5):
         (track,) = tracker.update([Seen(truth, np.zeros((11, 11)))], 0.1 * k)
     assert (track.id, track.seen) == (1, 5)
     np.testing.assert_allclose(track.superquadric.to_flat(), truth.to_flat(), atol=1e-12)
     assert np.linalg.eigvalsh(track.covariance).min() > 0
-
-
-def test_an_unknown_covariance_has_a_default():
-    seen = Seen(body(), np.full((11, 11), np.nan))
-    (track,) = Tracker().update([seen], 0.0)
-    np.testing.assert_allclose(track.sigma_size / track.superquadric.size, np.hypot(0.15, 0.01), rtol=1e-9)
-
-
-# One form
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Tracking: ids that last through crossings, hands and hiding, whatever frame the world has."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.optimize import linear_sum_assignment
@@ -23,10 +21,8 @@ from tracked_bodies import (
     spread_bodies,
 )
 
+from sq_perception import Camera, Recoverer, Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
 from sq_perception.simulation.sensor_noise import Ideal
 from sq_perception.tracking import association, state, visibility
@@ -90,28 +86,29 @@ def test_what_is_there_but_was_not_recovered_does_not_die(rng):
     assert [t.state for t in tracks] == [TrackState.LOST]
 
 
-def test_a_piece_beside_the_middle_of_what_is_seen_whole_does_not_stay(rng):
-    """Its centre is no nearer to the whole one's than another thing's may be, but it lies in it."""
-    whole = body((0.06, 0.05, 0.05), turn=(0, 0, 0))
-    piece, beside = (body((0.02, 0.02, 0.02), centre=(x, 0, 0.8), turn=(0, 0, 0)) for x in (0.05, 0.085))
-    depth = image_of([whole, beside])
-    for other, lives in ((piece, False), (beside, True)):
-        tracker = Tracker()
-        for k in range(20):
-            seen = [draw(each, noise(), rng) for each in ([whole, other] if k < 4 else [whole])]
-            tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
-        assert [t.id for t in tracks] == ([1, 2] if lives else [1])
+STRAIGHT = {"turn": (0, 0, 0)}
+WHOLE, CUT, REST = body((0.06, 0.05, 0.05), **STRAIGHT), body((0.05,) * 3, centre=(0.475, 0, 0.8), **STRAIGHT), body()
+PIECE, BESIDE = (body((0.02,) * 3, centre=(x, 0, 0.8), **STRAIGHT) for x in (0.05, 0.085))
 
 
-def test_what_the_border_of_the_image_cuts_is_seen_to_have_gone(rng):
-    """A third of it would be within the image; the table is seen there, or it."""
-    cut, rest = body((0.05, 0.05, 0.05), centre=(0.475, 0, 0.8), turn=(0, 0, 0)), body()
-    for scene, lives in (([rest], False), ([rest, cut], True)):
-        depth, tracker = image_of(scene), Tracker()
-        for k in range(20):
-            seen = [draw(each, noise(), rng) for each in ([rest, cut] if k < 4 else [rest])]
-            tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
-        assert [t.id for t in tracks] == ([1, 2] if lives else [1])
+@pytest.mark.parametrize(
+    ("stays", "other", "scene", "lives"),
+    [
+        (WHOLE, PIECE, [WHOLE, BESIDE], False),
+        (WHOLE, BESIDE, [WHOLE, BESIDE], True),
+        (REST, CUT, [REST], False),
+        (REST, CUT, [REST, CUT], True),
+    ],
+    ids=["a piece of it", "beside it", "cut by the border, gone", "cut by the border, there"],
+)
+def test_what_is_recovered_no_more_lives_as_long_as_the_image_shows_it(rng, stays, other, scene, lives):
+    """A piece lies in what is seen whole, though its centre is no nearer to the whole one's than another thing's may
+    be; a third of what the border cuts would be within the image, where the table is seen, or it."""
+    depth, tracker = image_of(scene), Tracker()
+    for k in range(20):
+        seen = [draw(each, noise(), rng) for each in ([stays, other] if k < 4 else [stays])]
+        tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
+    assert [t.id for t in tracks] == ([1, 2] if lives else [1])
 
 
 def test_nothing_hidden_lives_for_ever(rng):
@@ -209,27 +206,18 @@ def test_a_body_that_jumps_is_said_not_to_be_followed_at_first(rng):
     assert not tracker.update([], 1.3)[0].follows
 
 
-def test_another_body_elsewhere_is_another_one(rng):
-    tracker = Tracker()
-    for k in range(4):
-        tracker.update([draw(body(), noise(), rng)], 0.1 * k)
-    tracks = tracker.update([draw(body((0.03, 0.02, 0.09), centre=(0.08, 0.1, 0.8)), noise(), rng)], 0.5)
-    assert [t.id for t in tracks] == [1, 2]
-    assert [t.observation for t in tracks] == [None, 0]
-
-
-def test_a_long_gap_forgets_the_pose_and_keeps_the_sizes(rng):
-    truth, tracker = body(), Tracker()
+def test_another_body_elsewhere_is_another_one_and_a_long_gap_forgets_the_pose_and_keeps_the_sizes(rng):
+    truth, tracker, other = body(), Tracker(), Tracker()
     for k in range(5):
-        tracker.update([draw(truth, noise(), rng)], 0.1 * k)
+        for each in (tracker, other):
+            each.update([draw(truth, noise(), rng)], 0.1 * k)
+    tracks = other.update([draw(body((0.03, 0.02, 0.09), centre=(0.08, 0.1, 0.8)), noise(), rng)], 0.6)
+    assert [(t.id, t.observation) for t in tracks] == [(1, None), (2, 0)]
     pushed = Superquadric(truth.size, truth.shape, truth.translation + [0.05, 0, 0], truth.rotation)
     (track,) = tracker.update([draw(pushed, noise(), rng)], 8.0)
     assert (track.id, track.seen) == (1, 6)
     np.testing.assert_allclose(track.superquadric.translation, pushed.translation, atol=0.004)
     assert not track.velocity.any()
-
-
-# Frames
 
 
 def test_a_motion_of_the_world_changes_nothing(rng):
@@ -338,9 +326,6 @@ def test_what_was_handed_out_is_the_callers(rng):
     assert not after.velocity.any()
 
 
-# The real chain
-
-
 def frames_about(shown, count, step, rng, sigma=0.001):
     """Recovered frames of a camera that is carried about the middle of a table, with its poses and depth images."""
     middle = np.array([0, 0, shown.bodies.translation[:, 2].mean()])
@@ -394,9 +379,6 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
             last[track.id] = track.superquadric
     assert set(last) == {1, 2}
     assert len(named) > 2
-
-
-# What a node does without SciPy
 
 
 def test_the_limits_of_chi_squared_are_scipys():
