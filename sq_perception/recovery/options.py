@@ -31,8 +31,8 @@ class RecoveryOptions(SegmentationOptions):
         Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it objects are fitted as things, with a model error.
     repair
-        Part and join own segments, drop those of no object, and leave outliers out of fits, by a network; with the
-        method ``auto`` and a network that predicts hulls alone.  Masks from outside stay as they are.
+        Part and join own segments, drop those of no object, and leave outliers out of fits, by a network; of a pinhole
+        camera's images.  Masks from outside stay as they are.
     parts
         Whether to look for the parts of each object (:mod:`sq_perception.recovery.parts`), beside its body; with the
         methods ``auto`` and ``symmetry``, of a pinhole camera's images.

@@ -264,12 +264,12 @@ class Recoverer:
             yield
 
     def _segment(self, readings: Readings) -> FrameEvidence:
-        """The given masks, or own segments, which the network of masks improves where the other one predicts hulls."""
+        """The given masks, or own segments, which the network of masks improves."""
         depth, camera, options = readings.depth, readings.camera, readings.options
         if readings.labels is not None:
             return segments.from_labels(readings.labels, depth, camera, options)
         proposed = segments.propose(depth, camera, options.depth_range)
-        if options.repair and isinstance(self._network_for(readings), inference.ThingPredictor):
+        if options.repair and camera.is_pinhole:
             network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared, options.max_size)
             return segments.limit(network.improve(proposed), depth, camera, options)
         return segments.limit(segments.judge(proposed), depth, camera, options)
