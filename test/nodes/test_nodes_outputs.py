@@ -1,4 +1,4 @@
-"""What a frame node publishes for other stacks, when, and in which frame."""
+"""What a frame node publishes for other stacks and to be looked at, when, and in which frame."""
 
 import sys
 from collections.abc import Callable
@@ -13,10 +13,13 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 import soft_messages
 from builtin_interfaces.msg import Time
-from frame_node_bench import BOX, CAMERA, CAN
+from frame_node_bench import BOX, CAMERA, CAN, ball
 from frame_node_bench import recovery as one
+from sensor_msgs.msg import Image
 from stand_in_tf2 import Tf2
 from std_msgs.msg import Header
+from std_srvs.srv import SetBool
+from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py import poses
 from sq_perception import Camera, FrameRecovery, Recovery, Status, Superquadric
@@ -49,6 +52,12 @@ def found(*ids: int, header: Header = HEADER) -> publication.Findings:
     bodies = [one((BOX, CAN)[number % 2], number) for number in ids]
     failed = one(BOX, 99, Status.FAILED)
     return publication.findings(Identified(recovery(*bodies, failed), (*ids, 2**31 + 99)), header, is_cube=False)
+
+
+def shown(bodies: dict[int, Superquadric]) -> publication.Findings:
+    """Bodies by their ids."""
+    identified = Identified(recovery(*(one(body, k) for k, body in bodies.items())), tuple(bodies))
+    return publication.findings(identified, HEADER, is_cube=False)
 
 
 class Publisher:
@@ -215,9 +224,8 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
 
     def show(*bodies: Superquadric, **changes: Any) -> int:
         """How many objects are told of."""
-        count, ids = len(scene.sent), tuple(range(1, len(bodies) + 1))
-        identified = Identified(recovery(*(one(body, k) for k, body in enumerate(bodies, 1))), ids)
-        outputs.publish(publication.findings(identified, HEADER, is_cube=False), replace(ALL, **changes))
+        count = len(scene.sent)
+        outputs.publish(shown(dict(enumerate(bodies, 1))), replace(ALL, **changes))
         return len(objects(scene)) if len(scene.sent) > count else 0
 
     quivers = Superquadric(BOX.size + 2e-4, BOX.shape, BOX.translation + 2e-4, -BOX.rotation)
@@ -277,8 +285,7 @@ def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node, outputs):
     known: dict[str, Any] = {}
 
     def heard(bodies: dict[int, Superquadric]) -> None:
-        identified = Identified(recovery(*(one(body, k) for k, body in bodies.items())), tuple(bodies))
-        outputs.publish(publication.findings(identified, HEADER, is_cube=False), ALL)
+        outputs.publish(shown(bodies), ALL)
 
     def take() -> None:
         scene = node.publishers[SCENE]
@@ -401,11 +408,10 @@ def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
 
 def test_markers_lie_on_the_bodies(node):
     """Meshes in the body's frame and back again are those of the body in the frame of the image."""
-    shown = found(1, 2).markers().markers[1:]
-    assert [(marker.id, marker.ns.split("/")[1], marker.action) for marker in shown] == [
-        *((1, "surface", 0), (1, "outline", 0), (2, "surface", 0), (2, "outline", 0)),
-    ]
-    for marker, body in zip(shown, (CAN, CAN, BOX, BOX), strict=True):
+    drawn = found(1, 2).markers().markers[1:]
+    kinds = [(marker.id, marker.ns.split("/")[1], marker.action) for marker in drawn]
+    assert kinds == [(1, "surface", 0), (1, "outline", 0), (2, "surface", 0), (2, "outline", 0)]
+    for marker, body in zip(drawn, (CAN, CAN, BOX, BOX), strict=True):
         points = np.array([[p.x, p.y, p.z] for p in marker.points])
         np.testing.assert_allclose(body.gauge(points), 1, atol=1e-4)
 
@@ -509,3 +515,43 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
 def test_frames_that_tf2_would_not_take_are_refused(values):
     with pytest.raises(ParameterError, match=f"{next(iter(values))}: expected"):
         RecoverParameters(**values)
+
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+
+def test_pictures_are_made_while_somebody_listens(bench):
+    bench.set(bench.node, tracking=False)
+    bench.recoverer.bodies = (ball(1), ball(5), ball(6, Status.FAILED))
+    assert len(bench.answer(bench.depth())[1]) == 3
+    shown = bench.hear(MarkerArray, "recover_node/markers")
+    rendered = bench.hear(Image, "recover_node/rendered_depth")
+    outputs = bench.node._outputs
+    bench.until(lambda: outputs.markers.get_subscription_count() and outputs.rendered_depth.get_subscription_count())
+    assert not shown
+    image = bench.depth()
+    bench.answer(image)
+    bench.until(lambda: shown and rendered)
+    assert sorted({marker.id for marker in shown[0].markers[1:]}) == [1, 5]
+    assert all(marker.header == image.header for marker in shown[0].markers)
+    depth = publication.depth_of(rendered[0], False)[0].depth
+    assert rendered[0].header == image.header
+    assert np.nanmin(depth) == pytest.approx(0.4, abs=2e-3)
+    assert np.isnan(depth).any()
+
+
+@pytest.mark.parametrize("end", ["disabled", "deactivated", "ended"])
+def test_markers_go_with_the_one_who_would_move_them(bench, end):
+    shown = bench.hear(MarkerArray, "recover_node/markers")
+    bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
+    bench.recoverer.bodies = (ball(1), ball(5))
+    bench.answer(bench.depth())
+    bench.until(lambda: len(shown) == 1)
+    if end == "disabled":
+        assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
+    elif end == "deactivated":
+        bench.node._tasks.put(lambda: bench.node._change("deactivate"))
+    else:
+        bench.until(bench.node.close)
+    bench.until(lambda: len(shown) == 2)
+    assert [marker.action for marker in shown[1].markers] == [Marker.DELETEALL]

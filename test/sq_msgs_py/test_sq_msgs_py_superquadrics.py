@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sq_msgs_py.columns import points_from_message
-from sq_msgs_py.superquadrics import MessageError
-
 pytest.importorskip("sensor_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
 
 from builtin_interfaces.msg import Time
@@ -20,8 +17,9 @@ from std_msgs.msg import Header
 from visualization_msgs.msg import Marker
 
 from sq_msgs_py import superquadrics
+from sq_msgs_py.columns import points_from_message
 from sq_msgs_py.markers import PALETTE, markers
-from sq_msgs_py.superquadrics import FIELDS, Reason, SuperquadricArray
+from sq_msgs_py.superquadrics import FIELDS, MessageError, Reason, SuperquadricArray
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
 BEFORE = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
