@@ -27,7 +27,7 @@ def test_a_thing_is_likelier_the_surer_it_and_its_size_are_the_more_is_seen_and_
     assert each == sorted(each)
 
 
-@pytest.mark.parametrize(("likely", "affinity", "is_kept"), [(0.9, 0.0, True), (0.05, 0.0, False), (0.9, 0.9, False)])
+@pytest.mark.parametrize(("likely", "affinity", "is_kept"), [(0.9, 0.0, True), (0.2, 0.1, False), (0.9, 0.9, False)])
 def test_a_fragment_is_no_body_has_no_pixels_and_is_said(likely, affinity, is_kept):
     """The face of a box, less a strip of it, and that strip, whose body has no depth."""
     table = Table(pitch=0.9)
