@@ -72,13 +72,11 @@ _PLANE_SIGMA, _GAP_SIGMA, _REST_SIGMA = 0.001, 0.005, 0.05
 normal and an axis of the body: how well a plane fitted to a depth image is known, and a wide prior with long tails
 (:mod:`sq_perception.fitting.priors`).  Both lengths shrink with the model error of small things: without, household
 things 0.4 times as large lost 0.7 +- 0.3 % of IoU."""
-_PROPORTION_SIGMA = 1.0
-"""Standard deviation of a log size about the mean of the three: a factor e, a wide prior."""
 _VOLUME_PRICE = 0.5
 """Price of log(a1 a2 a3) in the cost: what the image does not determine is not to grow.  Chosen on scanned objects."""
 _ROUND_SIGMA = 0.06
 """Scale of log(a1 / a2) and 1 - e2 by which most things are round; see :mod:`sq_perception.fitting.priors`."""
-_HUBER, _INNER_CAUCHY = 1.0, 1.0
+_HUBER = 1.0
 """Noise levels up to which Huber's loss of a thing's rays is quadratic, and scale of Cauchy's loss behind its surface:
 what strays farther is another part of the thing, a neck or a handle."""
 TAPER_SIGMA = 0.3
@@ -94,7 +92,8 @@ def problem_of(observation: Observation, options: FitOptions, deadline: float) -
     hull = options.predicted_hull() if model_error else None
     terms = Terms(
         hit_tolerance=_HIT_TOLERANCE, pinhole=1.0 if observation.camera.is_pinhole else 0.0,
-        outline_stiffness=1 / observation.outline, proportion_stiffness=1 / _PROPORTION_SIGMA,
+        outline_stiffness=1 / observation.outline,
+        proportion_stiffness=1.0,  # a factor e about the mean of the three: a wide prior
     )
     if plane is not None:
         scale = min((model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
@@ -104,7 +103,7 @@ def problem_of(observation: Observation, options: FitOptions, deadline: float) -
         )
     if model_error:
         observation = observation.of_hull()
-        terms = terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY)
+        terms = terms._replace(huber=_HUBER, inner_cauchy=_HUBER)
         if hull is None:
             terms = terms._replace(volume_price=_VOLUME_PRICE, roundness_stiffness=1 / _ROUND_SIGMA)
         else:

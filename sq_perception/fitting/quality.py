@@ -48,9 +48,6 @@ _NEAR_AXIS = 16
 degrees apart."""
 _REACHED = 0.9
 """Share of the points of a thing fitted as a hull: how far the rest sticks out decides whether it is enclosed."""
-_ENCLOSED_SHARE = 1.0
-"""Share of the middle half size by which points may stick out of a hull: a body that encloses a thing but for a
-trigger, a spout or a rim is one that a planner can use with care; those that left out more had an IoU below 0.45."""
 _UNFINISHED = "how far it is off is not known"
 _AXES = "xyz"
 
@@ -248,7 +245,9 @@ def judge(
     smallest = float(body.size.min())
     # A quarter of the thickness of a plate or a pen is less than any thing strays.
     strays = max(FAILED_SHARE * smallest, INLIER * sigma)
-    bearable = max(strays, _ENCLOSED_SHARE * float(np.median(body.size))) if as_hull else strays
+    # A body that encloses a thing but for a trigger, a spout or a rim is one that a planner can use with care; those
+    # that left out more had an IoU below 0.45.
+    bearable = max(strays, float(np.median(body.size))) if as_hull else strays
     off = f"many of the points lie {typical / smallest:.0%} of its smallest half size and more off"
     if typical > bearable:
         return Status.FAILED, f"no superquadric found: {off} the best one"

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sq_perception.fitting import starts
-from sq_perception.fitting.cost import Ray, Rays
+from sq_perception.fitting.cost import SAMPLE, Ray, Rays
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import (
     SETTLE,
@@ -55,8 +55,6 @@ _FACE_SHARE = 0.04
 """Share of all rays that have a depth in common, from which on it is that of a face."""
 _DEAD_ZONE = 0.5 * 1.01
 """Residual, in steps, up to which it counts as 0: half a step, and a little for single precision."""
-_RAYS = 1000
-"""Rays of a question to a body at hand, and of the search for each body of a walk, which begins at a neighbour's."""
 _PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
 """Factors from one half size to the next, up and down from the one at hand."""
 _UNLIKELY = 12.0
@@ -178,7 +176,7 @@ def plausible_depths(solution: Solution) -> tuple[State, list[Alternative]]:
     mean of all.
     """
     best, observation = solution.state, solution.problem.observation
-    rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
+    rays = solution.rays.every(max(1, len(solution.rays.hits) // SAMPLE))
     problem = solution.problem.with_terms(dead_zone=_DEAD_ZONE * observation.noise.quantum / observation.sigma)
     walk = _walk(problem, rays, best, math.inf)
     if min(each.state.cost for each in walk) < _ALLOWED and _weigh(walk)[1] < _CERTAIN:
@@ -245,7 +243,7 @@ def lengthen_open_ends(solution: Solution) -> Solution:
     if not ends:
         return solution
     problem = problem.with_terms(hull_directions=problem.terms.hull_directions[:0])
-    rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
+    rays = solution.rays.every(max(1, len(solution.rays.hits) // SAMPLE))
     most = problem.descend(state, rays, 0).cost + _NO_EVIDENCE
     found = []
     for axis, sign in ends:

@@ -1,6 +1,7 @@
 """What benchmarks measure with: errors, hulls, segments, figures of a scene, cameras, and what they change and undo."""
 
 import ablation
+import fit_parts
 import household_things
 import numpy as np
 import public_frames
@@ -154,6 +155,12 @@ def test_a_scene_has_the_figures_of_its_truth() -> None:
 @pytest.mark.parametrize("row", ablation.ROWS, ids=lambda row: row.name)
 def test_what_a_row_changes_in_the_program_exists(row: ablation.Row) -> None:
     with row.program():
+        pass
+
+
+@pytest.mark.parametrize("part", fit_parts.PARTS)
+def test_a_part_that_is_left_out_of_the_fit_exists(part: str) -> None:
+    with fit_parts.PARTS[part]():
         pass
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import alike
-from sq_perception.fitting.starts import other_orders, resized
+from sq_perception.fitting.starts import other_orders, resized, turned
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -42,6 +42,14 @@ def test_other_orders_are_the_same_box(state: State) -> None:
         assert np.linalg.det(other.rotation) == pytest.approx(1)
         assert box(other) == box(state)
         assert abs(other.rotation[:, 2] @ state.rotation[:, 2]) < 1e-9
+
+
+def test_a_turned_body_keeps_its_axis_and_the_moments_of_its_section(state: State) -> None:
+    other = turned(state)
+    assert np.linalg.det(other.rotation) == pytest.approx(1)
+    np.testing.assert_allclose(other.rotation[:, 2], state.rotation[:, 2], atol=1e-12)
+    assert abs(other.rotation[:, 0] @ state.rotation[:, 0]) == pytest.approx(np.sqrt(0.5))
+    assert (other.parameters[:2] ** 2).sum() == pytest.approx((state.parameters[:2] ** 2).sum())
 
 
 def test_alike_are_bodies_of_the_same_sizes_and_cost(state: State) -> None:
