@@ -44,8 +44,8 @@ _UNASKED = 3.4
 LEAST = 0.2
 """What is less likely a thing is left out: a thing that is missed costs as much as four bodies of nothing."""
 _BODY_WEIGHTS = (0.2, -0.8, 0.7, -0.5, -4.0, -2.2)
-"""a' to f', a regression on bodies of benchmarks/household_things.  The score of the body, and how much hides it, are not
-used: they would leave out things that are half hidden."""
+"""a' to f', a regression on bodies of benchmarks/household_things.  The score of the body, and how much hides it, are
+not used: they would leave out things that are half hidden."""
 LEAST_POSTERIOR = 0.25
 """What is less likely a thing is left out with its body."""
 _BLOCKS = (4, 32)
