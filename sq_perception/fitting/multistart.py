@@ -46,7 +46,7 @@ class Stage(NamedTuple):
 # Chosen on benchmarks/single_body and benchmarks/household_things.
 COARSE = Stage(SAMPSON, 150, 8, 3, 0.5)
 BASIN = (Stage(SAMPSON, 300, 15, 3, 0.7), Stage(RENDERED, 300, 15, 3, 0.7))
-THING = (Stage(RENDERED, 150, 5, 4, 0.7), Stage(RENDERED, 150, 10, 3, 0.7))
+THING = (Stage(RENDERED, 150, 8, 4, 0.7), Stage(RENDERED, 150, 15, 3, 0.7))
 SETTLE = Stage(RENDERED, 300, 15, 3, 0.2)
 
 FREE_SHARE = 0.25
