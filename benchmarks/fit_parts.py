@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Literal
 from unittest.mock import patch
 
 import ablation
@@ -64,11 +64,10 @@ class Item:
     camera: Camera
     options: FitOptions
     truth: Superquadric | np.ndarray
-    start: Superquadric | None = None
+    start: Superquadric | Literal["auto"] = "auto"
 
     def fit(self) -> Fit:
-        start = "auto" if self.start is None else self.start
-        return surface_fit.fit(self.depth, self.mask, self.camera, start=start, options=self.options)
+        return surface_fit.fit(self.depth, self.mask, self.camera, start=self.start, options=self.options)
 
     def iou(self, body: Superquadric) -> float:
         if isinstance(self.truth, Superquadric):
@@ -77,6 +76,7 @@ class Item:
 
     @cached_property
     def _columns(self) -> Columns:
+        assert isinstance(self.truth, np.ndarray)
         return Columns.of(self.truth)
 
     def size_errors(self, body: Superquadric) -> np.ndarray:
@@ -138,7 +138,7 @@ def household(first: int, scenes: int) -> Iterator[Item]:
 
 def without_hull(first: int, scenes: int) -> Iterator[Item]:
     for item in list(household(first, scenes))[::3]:
-        yield replace(item, start=None, options=replace(item.options, hull=None, expected=None))
+        yield replace(item, start="auto", options=replace(item.options, hull=None, expected=None))
 
 
 def tabletop(first: int, scenes: int) -> Iterator[Item]:
@@ -162,7 +162,7 @@ def lying_cans(count: int) -> Iterator[Item]:
         plane = np.append(up, radius - up @ can.translation)
         rendered, _ = raycast.render(can, CAN_CAMERA)
         depth = np.minimum(rendered, plane_depth(plane, CAN_CAMERA))
-        depth = depth + rng.normal(0, 0.0015, depth.shape) * depth**2
+        depth = depth + rng.normal(0, 0.0015, depth.shape) * np.where(np.isfinite(depth), depth, 0.0) ** 2
         yield Item("can", depth, np.isfinite(rendered), CAN_CAMERA, FitOptions(plane=plane), can)
 
 
