@@ -253,7 +253,7 @@ def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> Non
     shutil.copy(source / "__init__.py", package)
     program = (
         "import numpy as np; from sq_perception.geometry.metrics import _column;"
-        "body = np.array([1.0, 1, 1, 1, 1, 0, 0, 0]);"
+        "body = np.append(np.ones(5), np.zeros(9));"
         "print(_column(body, np.eye(3), 0.0, 0.0, -2.0, 0.5, 9))"
     )
     edited = package / "geometry" / "kernels.py"
