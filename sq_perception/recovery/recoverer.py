@@ -41,7 +41,6 @@ from sq_perception.geometry.threads import one_blas_thread, short_turns
 from sq_perception.imaging import hole_filling, raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
-from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import methods, parts, seen_object, supports
 from sq_perception.recovery.cavities import find_cavity
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
@@ -114,12 +113,10 @@ class Recoverer:
         self._path = model
         self._device = inference.check_device(device)
         self._loaded: dict[bool, Network] = {}
-        self._masks: CompactMasks | None = None
+        self._masks = inference.load_masks()
         self._begin()
         if method in NEEDS_NETWORK:
             self._load_network(method == "auto")
-        if method == "auto":
-            self._load_masks()
 
     def _begin(self) -> None:
         """Make the threads and the lock of this process."""
@@ -270,7 +267,7 @@ class Recoverer:
             return segments.from_labels(readings.labels, depth, camera, options)
         proposed = segments.propose(depth, camera, options.depth_range)
         if options.repair and camera.is_pinhole:
-            network = SegmentNetwork(self._load_masks(), depth, camera, proposed.plane, self._shared, options.max_size)
+            network = SegmentNetwork(self._masks, depth, camera, proposed.plane, self._shared, options.max_size)
             return segments.limit(network.improve(proposed), depth, camera, options)
         return segments.limit(segments.judge(proposed), depth, camera, options)
 
@@ -343,9 +340,3 @@ class Recoverer:
                 network = (inference.load_things if is_hull else inference.load)(self._path, self._device)
                 self._loaded.update(dict.fromkeys(kinds, network))
             return self._loaded[of_things]
-
-    def _load_masks(self) -> CompactMasks:
-        with self._lock:
-            if self._masks is None:
-                self._masks = inference.load_masks()
-            return self._masks
