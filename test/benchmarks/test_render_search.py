@@ -1,6 +1,5 @@
 """The grid search of figure 7.6: what it computes, and that the script draws it."""
 
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -33,9 +32,7 @@ def test_thesis_parameters_do_as_well_as_the_thesis_says() -> None:
     assert found.best[2] < 0.0056
 
 
-def test_the_script_prints_the_optimum_and_draws_the_map(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_script_prints_the_optimum_and_draws_the_map(capsys, tmp_path, monkeypatch) -> None:
     picture = tmp_path / "map.png"
     arguments = ["--bodies", "2", "--resolution", "16", "--steps", "4", "--picture", str(picture)]
     monkeypatch.setattr("sys.argv", ["render_search.py", *arguments])

@@ -1,7 +1,5 @@
 """Things under so much noise that a superquadric explains them: what it hides of their form is in the deviations."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

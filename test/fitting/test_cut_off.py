@@ -1,7 +1,5 @@
 """What the border of the image cuts off: how long it is stays open, unless its shape tells."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table
@@ -17,9 +15,7 @@ CAN = (0.035, 0.035, 0.06), (0.1, 1.0)
 BALL = (0.04, 0.04, 0.04), (1.0, 1.0)
 
 
-def lower_half(
-    size: tuple[float, ...], shape: tuple[float, ...], seed: int, as_thing: bool = False, dark: int = 0
-) -> tuple[Superquadric, Fit]:
+def lower_half(size, shape, seed, as_thing=False, dark=0) -> tuple[Superquadric, Fit]:
     """A body of which the image shows the lower half, and its fit; of a thing, a hull is predicted that ends there.
 
     Above the image are ``dark`` rows without readings, as rectified ones have them.

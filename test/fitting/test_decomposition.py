@@ -1,7 +1,5 @@
 """Several bodies to one object: how many, where, how sure; from clouds and from meshes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

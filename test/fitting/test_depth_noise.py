@@ -1,7 +1,5 @@
 """How noisy a depth image is: estimated on planes and bodies whose noise is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

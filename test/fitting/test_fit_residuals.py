@@ -1,7 +1,5 @@
 """The compiled residuals against their torch statement: values, and derivatives against autograd."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 
@@ -21,9 +19,7 @@ PLAIN = Terms(huber=np.inf, outline_huber=np.inf)
 SIGMA = 0.003
 
 
-def random_body(
-    rng: np.random.Generator, shape: tuple[float, float] | None = None, taper: tuple[float, float] = (0.0, 0.0)
-) -> Superquadric:
+def random_body(rng, shape=None, taper=(0.0, 0.0)) -> Superquadric:
     exponents = rng.uniform(0.1, 1.0, 2) if shape is None else np.array(shape)
     size, centre = rng.uniform(0.03, 0.1, 3), rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.6]
     return Superquadric(size, exponents, centre, quaternions.random(1, rng)[0], np.asarray(taper))
@@ -59,15 +55,7 @@ def expected_sums(body: Superquadric, residuals: Callable[[Superquadric], torch.
     return float(values @ values), np.concatenate([jacobian.T @ jacobian, (jacobian.T @ values)[None]])
 
 
-def assert_same(
-    stage: int,
-    rays: np.ndarray,
-    free: np.ndarray,
-    terms: Terms,
-    body: Superquadric,
-    expected: tuple[float, np.ndarray],
-    tolerance: float = 1e-5,
-) -> None:
+def assert_same(stage, rays, free, terms, body, expected, tolerance=1e-5) -> None:
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     state = State.of(body)
     cost = evaluate(stage, rays, free, terms, state.parameters, state.rotation, rays[:, Ray.DEPTH].copy(), sums)
@@ -88,9 +76,7 @@ SHAPES = [None, (0.1, 0.1), (0.02, 0.05), (1.0, 1.0), (0.1, 1.0), (1.0, 0.1), (1
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
 @pytest.mark.parametrize("taper", TAPERS)
-def test_point_residuals_and_derivatives(
-    taper: tuple[float, float], stage: int, shape: tuple[float, float] | None, rng: np.random.Generator
-) -> None:
+def test_point_residuals_and_derivatives(taper, stage, shape, rng) -> None:
     body = random_body(rng, shape, taper)
     points = body.sample_surface(60, rng) + rng.normal(0, 0.004, (60, 3))
     function = statement.classic if stage == CLASSIC else statement.sampson
@@ -117,9 +103,7 @@ def visible_points(body: Superquadric, rng: np.random.Generator, pinhole: bool) 
 
 @pytest.mark.parametrize("shape", SHAPES[:5])
 @pytest.mark.parametrize(("pinhole", "taper"), zip([True, False], TAPERS, strict=True))
-def test_rendered_depth_and_derivatives(
-    pinhole: bool, taper: tuple[float, float], shape: tuple[float, float] | None, rng: np.random.Generator
-) -> None:
+def test_rendered_depth_and_derivatives(pinhole, taper, shape, rng) -> None:
     body = random_body(rng, shape, taper)
     rays = rays_to(visible_points(body, rng, pinhole), pinhole)
     rays[:, Ray.DEPTH] += rng.normal(0, 0.003, len(rays))

@@ -1,7 +1,5 @@
 """A predicted support function in the fit: its derivatives, and the unseen side that it tells."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -155,9 +153,7 @@ def box_from_the_front() -> tuple[np.ndarray, np.ndarray, Superquadric, np.ndarr
 
 
 @pytest.mark.parametrize("deep", [0.02, 0.03, 0.05])
-def test_a_prediction_tells_the_depth_behind_a_front(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray], deep: float
-) -> None:
+def test_a_prediction_tells_the_depth_behind_a_front(box_from_the_front, deep) -> None:
     depth, mask, body, plane = box_from_the_front
     front = body.translation[2] - 0.03
     told_body = Superquadric([0.04, deep, 0.06], body.shape, [*body.translation[:2], front + deep], body.rotation)
@@ -169,9 +165,7 @@ def test_a_prediction_tells_the_depth_behind_a_front(
     assert height == pytest.approx(0.06, abs=0.005)
 
 
-def test_a_vague_prediction_leaves_the_size_open(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
-) -> None:
+def test_a_vague_prediction_leaves_the_size_open(box_from_the_front) -> None:
     """What is predicted less surely comes out less surely: the deviation is that of the posterior."""
     depth, mask, body, plane = box_from_the_front
     widest = []
@@ -181,9 +175,7 @@ def test_a_vague_prediction_leaves_the_size_open(
     assert widest[1] > 1.5 * widest[0]
 
 
-def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(box_from_the_front, monkeypatch) -> None:
     """No superquadric explains it: none is sought from everywhere, and its far side is the predicted one."""
     _, mask, body, _ = box_from_the_front
     shown, _ = raycast.render(body, CAMERA)
@@ -197,9 +189,7 @@ def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
     assert found.superquadric.size.max() == pytest.approx(0.06, abs=0.01)
 
 
-def test_a_thing_cut_short_is_no_surer_than_one_with_time(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
-) -> None:
+def test_a_thing_cut_short_is_no_surer_than_one_with_time(box_from_the_front) -> None:
     """What no superquadric fits counts as fewer rays, whether or not there is time to go on."""
     depth, mask, body, plane = box_from_the_front
     dents = 0.012 * np.sin(np.linspace(0, 40, depth.shape[1], dtype=np.float32))
@@ -213,9 +203,7 @@ def test_a_thing_cut_short_is_no_surer_than_one_with_time(
     assert (by_length[0] > 0.9 * by_length[1]).all()
 
 
-def test_no_form_of_a_hull_is_compiled_for(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
-) -> None:
+def test_no_form_of_a_hull_is_compiled_for(box_from_the_front) -> None:
     """A camera would wait for it: 12 s for single precision and read only arrays, 2 s for a whole number."""
     depth, mask, body, plane = box_from_the_front
     usual = told(body, 0.004)

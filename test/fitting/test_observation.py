@@ -1,7 +1,5 @@
 """Which pixels of a mask are taken for the object."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -40,9 +38,7 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 @pytest.mark.parametrize("pixels", [1, 2, 3])
 @pytest.mark.parametrize("truth", [BOX, CAN], ids=["box", "can"])
-def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(
-    truth: Superquadric, pixels: int, rng: np.random.Generator
-) -> None:
+def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(truth, pixels, rng) -> None:
     """What is behind a thing goes on from its foot by way of the table, without a step."""
     depth, mask = image(truth, rng)
     fit = surface_fit.fit(depth, grown(mask, pixels), CAMERA, options=FitOptions(plane=TABLE))

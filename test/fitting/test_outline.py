@@ -1,7 +1,5 @@
 """The outline of a body: reading its precision ends, whatever is read, and makes it no less precise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

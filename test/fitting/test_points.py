@@ -1,7 +1,5 @@
 """One body to points from all sides or some: closed forms, invariances, outliers, calibration, bad input."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Other bodies that might explain an image: what they keep of the one at hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Faces that look at the camera through rounded readings: what is open, and that it is said so."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

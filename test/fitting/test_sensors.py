@@ -1,7 +1,5 @@
 """Fits to what simulated sensors measure of a body on a table."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sq_perception.fitting import surface_fit

@@ -1,7 +1,5 @@
 """The classic fit: exact on complete clouds, plausible on views, honest on bad input."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The surface fit: exact on clean images of both cameras, robust on bad ones, honest about what it cannot know."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What tells the size that a camera did not see: symmetry of revolution, a prediction, and how much was seen at all."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -46,9 +46,7 @@ FORMS = [(shape, taper) for taper in (STRAIGHT, TAPERED) for shape in ((0.1, 0.1
 
 
 @pytest.mark.parametrize(("shape", "taper"), [*FORMS, ((1.5, 1.8), STRAIGHT), ((1.5, 1.8), (0.3, 0.3))])
-def test_it_never_exceeds_the_distance_and_comes_near_it(
-    shape: tuple[float, float], taper: tuple[float, float]
-) -> None:
+def test_it_never_exceeds_the_distance_and_comes_near_it(shape, taper) -> None:
     """Outside, no point of the surface is nearer; the samples of it are farther than the nearest."""
     body = placed([1.0, 0.6, 0.3], list(shape), taper)
     surface = body.sample_surface(4000, np.random.default_rng(3))

@@ -145,9 +145,7 @@ class TestShippedWeights:
             ("robust", ViewSource(), 0.3, 0.85, 0.6),
         ],
     )
-    def test_they_read_unseen_bodies(
-        self, name: str, source: ViewSource, hidden: float, least: float, over_85: float
-    ) -> None:
+    def test_they_read_unseen_bodies(self, name, source, hidden, least, over_85) -> None:
         """Networks alone, on bodies of seeds that no training uses."""
         rng = np.random.default_rng(123456)
         views, truth = draw_views(300, rng, source, any_occluder(np.full(300, hidden), rng) if hidden else None)
@@ -229,9 +227,7 @@ class TestCheckpoint:
         ],
         ids=lambda change: " ".join(change) + " " + str(next(iter(change.values())))[:12],
     )
-    def test_hostile_headers_are_refused_before_they_cost_memory(
-        self, config: RegressorConfig, change: dict[str, Any], tmp_path: Path
-    ) -> None:
+    def test_hostile_headers_are_refused_before_they_cost_memory(self, config, change, tmp_path) -> None:
         """Any of these networks in full would take gigabytes, or never end."""
         header = {"format": checkpoint.FORMAT, "version": checkpoint.VERSION}
         header["config"] = json.dumps({**asdict(config), **change})

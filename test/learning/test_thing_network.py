@@ -109,9 +109,7 @@ def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> No
         assert torch.allclose(weights.float(), network.state_dict()[name].float(), rtol=1e-3, atol=1e-4), name
 
 
-def test_it_begins_with_no_network_of_another_kind_and_no_other_goes_on_with_its_state(
-    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_begins_with_no_network_of_another_kind_and_no_other_goes_on_with_its_state(tmp_path, rng, capsys) -> None:
     shards(tmp_path / "views", 3, rng)
     run = ["train-things", str(tmp_path / "views"), "--output", str(tmp_path / "run"), "--batch", "2"]
     for start, kind in (("masks", "masks"), ("robust", "regressor")):
@@ -193,9 +191,7 @@ def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("processed", "least", "most"), [(0.0, 0.8, 1.25), (1.0, 0.9, 1.5)])
-def test_the_shipped_network_says_how_well_it_knows(
-    processed: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_shipped_network_says_how_well_it_knows(processed, least, most, monkeypatch) -> None:
     """On views that no training saw: the error of the support function, and its deviation in units of the said one."""
     monkeypatch.setattr(thing_views, "PROCESSED", processed)
     held = draw_thing_views(240, np.random.default_rng([77, 1]))

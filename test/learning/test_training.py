@@ -157,9 +157,7 @@ class TestLearning:
         assert [record["step"] for record in log_of(tmp_path)] == [20, 40]
 
     @pytest.mark.parametrize("loss", ["dual", "render"])
-    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(
-        self, loss: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(self, loss, tmp_path, monkeypatch) -> None:
         given = []
         compute = Objective.loss
 
@@ -184,9 +182,7 @@ def test_bfloat16_is_used_where_the_processor_has_it(monkeypatch: pytest.MonkeyP
         assert not torch.is_autocast_enabled("cpu")
 
 
-def test_a_thread_count_holds_for_network_and_rendering_and_ends_with_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_thread_count_holds_for_network_and_rendering_and_ends_with_the_run(tmp_path, monkeypatch) -> None:
     """A second thread that waits by spinning starves a run on a busy machine."""
     before, during = (torch.get_num_threads(), numba.get_num_threads()), set()
     draw = train.ViewPool.batch
@@ -234,9 +230,7 @@ class TestInterruptions:
         assert json.loads(checkpoint.read_header(tmp_path / "last.safetensors")["metrics"])["step"] >= 2
         checkpoint.load(tmp_path / "last.safetensors")
 
-    def test_divergence_keeps_the_last_good_state_and_says_so(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_divergence_keeps_the_last_good_state_and_says_so(self, tmp_path, monkeypatch) -> None:
         train.train(RUN, tmp_path, SMALL)
         before = (tmp_path / "state.safetensors").read_bytes()
         draw = train.ViewPool.batch

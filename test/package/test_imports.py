@@ -1,7 +1,5 @@
 """The house rules: imports run one way, and importing does nothing but import."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

@@ -67,10 +67,7 @@ def info(stamp: float, k: np.ndarray = K, size: tuple[int, int] = (160, 120), di
     )
 
 
-def write(
-    path: Path, messages: list[tuple[str, float, Any]], storage: StoragePlugin = StoragePlugin.MCAP,
-    mode: CompressionMode = CompressionMode.NONE,
-) -> Path:
+def write(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE) -> Path:
     """A bag of (topic, second of recording, message); where the message is bytes, the topic is one of images."""
     writer = Writer(path, version=9, storage_plugin=storage)
     if mode is not CompressionMode.NONE:

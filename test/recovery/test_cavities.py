@@ -1,7 +1,5 @@
 """Cavities of vessels: an open cup has one where it is and as deep as it is, a full one and one from below has none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA

@@ -1,7 +1,5 @@
 """Many crops in one call: the answers of single calls, in their order, whoever computes them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A fragment of a thing is left out once its body is known, and that is said; a thing beside another one is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table

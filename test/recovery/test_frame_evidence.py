@@ -1,7 +1,5 @@
 """What a frame shows of its objects together: one that may go on in another is less sure of its sizes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table

@@ -1,7 +1,5 @@
 """Own segments through the network of masks: outliers go, pieces of one thing are joined, two things stay two."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

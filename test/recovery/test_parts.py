@@ -1,7 +1,5 @@
 """Parts of objects: what was seen of them is found, and nothing else is."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The chain of all stages: known bodies come back, whatever way they were seen; hard images get an answer too."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

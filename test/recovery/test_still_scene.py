@@ -1,7 +1,5 @@
 """Frames that repeat others: what stands still is not recovered again, and what changed is noticed at once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What objects stand on: the table, or the tops of others; what stands behind another one stands on the table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

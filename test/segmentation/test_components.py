@@ -1,7 +1,5 @@
 """Components of what is above a support: cut at depth steps, without what a sensor smears over them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sq_perception.imaging.camera import Camera

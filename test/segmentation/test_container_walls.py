@@ -1,7 +1,5 @@
 """Walls of bins and trays are walls; boxes, cans, books and bowls are things, however they stand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou

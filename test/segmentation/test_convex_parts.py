@@ -1,7 +1,5 @@
 """Lines of sight: free within a convex body, crossed between two; segments follow, whatever the noise bends."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import ious

@@ -13,8 +13,6 @@ status is not CONVERGED.  A body that is vouched for is wild, with its measured 
 with the true support where the frame has one, otherwise the one that was found if the points lie above it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -288,9 +286,7 @@ def test_noise_in_the_corner_of_a_room_makes_no_wild_body(recoverer: Recoverer) 
 @pytest.mark.parametrize("sensor", ["realsense_d435", "kinect_v1"])
 @pytest.mark.parametrize("kind", ROOMS)
 @pytest.mark.parametrize("masks", ["whole image", "random tiles"])
-def test_masks_in_a_room_without_things_make_no_wild_bodies(
-    recoverer: Recoverer, kind: str, sensor: str, masks: str
-) -> None:
+def test_masks_in_a_room_without_things_make_no_wild_bodies(recoverer, kind, sensor, masks) -> None:
     frame = seen(kind, sensor)
     if masks == "whole image":  # then the table itself is the object, and stands on nothing
         frame = replace(frame, support=None)
@@ -312,9 +308,7 @@ def test_masks_in_a_frame_of_nothing_make_no_wild_bodies(recoverer: Recoverer, n
 
 @pytest.mark.parametrize("size", [(3, 7), (33, 21), (64, 48)])
 @pytest.mark.parametrize("seed", range(4))
-def test_bits_that_are_no_depth_raise_nothing_and_make_no_infinite_body(
-    recoverer: Recoverer, size: tuple[int, int], seed: int
-) -> None:
+def test_bits_that_are_no_depth_raise_nothing_and_make_no_infinite_body(recoverer, size, seed) -> None:
     """Random bits are readings from 1e-45 to 3e38 m, whose squares are no numbers."""
     width, height = size
     camera = Camera(width, height, 60.0, 60.0, (width - 1) / 2, (height - 1) / 2)

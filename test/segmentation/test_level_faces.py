@@ -1,7 +1,5 @@
 """What stands on a carton is a thing of its own, and neither a bare carton nor a vessel falls apart."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou, ious

@@ -1,7 +1,5 @@
 """What is a thing: its height over its whole area, what is too large and what is alone, and what is said of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou, ious, judged_by_network

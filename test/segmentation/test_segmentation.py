@@ -1,7 +1,5 @@
 """Segmentation: objects with known masks on a known plane, and images that hold none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou, ious, noisy

@@ -1,7 +1,5 @@
 """Surfaces are no objects: tables that sensors bend, tables without a border, room corners, what stands beyond."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Bodies that touch, stand on each other, hide each other, or are hollow: one segment each, on seeded noise."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, ious, judged_by_network, noisy
