@@ -139,9 +139,7 @@ def box_from_the_front() -> tuple[np.ndarray, np.ndarray, Superquadric, np.ndarr
     tilt = math.radians(12.0)
     normal = np.array([0.0, -math.cos(tilt), -math.sin(tilt)])
     axes = np.stack([[1.0, 0.0, 0.0], np.cross(normal, [1.0, 0.0, 0.0]), normal], axis=1)
-    from sq_perception.geometry import rotation as quaternions
-
-    body = Superquadric([0.04, 0.03, 0.06], [0.1, 0.1], [0.0, 0.02, 0.55], quaternions.from_matrix(axes))
+    body = Superquadric([0.04, 0.03, 0.06], [0.1, 0.1], [0.0, 0.02, 0.55], rotation.from_matrix(axes))
     plane = np.append(normal, -normal @ (body.translation - 0.06 * normal))
     shown, _ = raycast.render(body, CAMERA)
     mask = np.isfinite(shown)

@@ -92,6 +92,7 @@ def test_clean_thesis_images(seed: int) -> None:
     assert fit.status == Status.CONVERGED
     assert fit.residual < 0.6 * GREY
     assert fit.inlier_share > 0.97
+    assert fit.superquadric.canonical_form().to_flat() == pytest.approx(fit.superquadric.to_flat())
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -101,17 +102,6 @@ def test_clean_pinhole_images(seed: int) -> None:
     fit = surface_fit.fit(depth, mask, CAMERA)
     assert iou(fit, truth) > 0.97
     assert fit.noise == pytest.approx(1e-3 / np.sqrt(12), rel=0.5)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_noise_of_two_grey_levels(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = thesis_body(rng)
-    image = thesis_image(truth)
-    noisy = np.clip(np.round(image + rng.normal(0, 2, image.shape)), 1, 255)
-    fit = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8))
-    assert iou(fit, truth) > 0.9
-    assert fit.noise == pytest.approx(2 * GREY, rel=0.15)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -277,7 +267,7 @@ def test_a_box_seen_face_on_is_weak_and_says_what_is_missing() -> None:
     assert within >= 4
 
 
-def test_reported_deviations_cover_the_errors() -> None:
+def test_deviations_cover_the_errors_under_noise_of_two_grey_levels() -> None:
     within, total = 0, 0
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
@@ -285,6 +275,8 @@ def test_reported_deviations_cover_the_errors() -> None:
         image = thesis_image(truth)
         noisy = np.clip(np.round(image + rng.normal(0, 2, image.shape)), 1, 255)
         fit = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8))
+        assert iou(fit, truth) > 0.9
+        assert fit.noise == pytest.approx(2 * GREY, rel=0.15)
         order = np.argsort(fit.superquadric.size)
         error = np.abs(fit.superquadric.size[order] - np.sort(truth.size))
         within += int((error < 2 * fit.sigma_size[order]).sum())
@@ -292,25 +284,6 @@ def test_reported_deviations_cover_the_errors() -> None:
         assert fit.covariance == pytest.approx(fit.covariance.T)
         assert np.linalg.eigvalsh(fit.covariance).min() > 0
     assert within / total > 0.75
-
-
-def test_more_noise_means_less_certainty() -> None:
-    rng = np.random.default_rng(11)
-    truth = thesis_body(rng)
-    image = thesis_image(truth)
-    previous = fit_grey(image).sigma_size.max()
-    for sigma in (2, 6):
-        noisy = np.clip(np.round(image + rng.normal(0, sigma, image.shape)), 1, 255)
-        sure = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8)).sigma_size.max()
-        assert sure > previous
-        previous = sure
-
-
-def test_the_result_is_in_canonical_form() -> None:
-    truth = thesis_body(np.random.default_rng(2))
-    body = fit_grey(thesis_image(truth)).superquadric
-    assert body.canonical_form().to_flat() == pytest.approx(body.to_flat())
-    assert body.size[0] >= body.size[1]
 
 
 def test_a_time_budget_ends_the_search() -> None:
@@ -332,22 +305,6 @@ def square_mask(rows: int, columns: int) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize(
-    ("depth", "mask", "reason"),
-    [
-        (FLAT, square_mask(1, 1), "1 pixels"),
-        (FLAT, square_mask(1, 11), "11 pixels"),
-        (FLAT, square_mask(1, 40), "line"),
-    ],
-)
-def test_too_few_pixels_fail_with_a_reason(depth: np.ndarray, mask: np.ndarray, reason: str) -> None:
-    fit = surface_fit.fit(depth, mask, CAMERA)
-    assert fit.status == Status.FAILED
-    assert reason in fit.message
-    assert np.isfinite(fit.superquadric.to_flat()).all()
-    assert (fit.superquadric.size > 0).all()
-
-
 def test_noise_does_not_pull_bodies_on_a_plane_towards_the_camera() -> None:
     """Points before and behind the surface weigh alike where a superquadric explains the image; 2 mm of noise."""
     shift = []
@@ -359,26 +316,6 @@ def test_noise_does_not_pull_bodies_on_a_plane_towards_the_camera() -> None:
         sight = truth.translation / np.linalg.norm(truth.translation)
         shift.append(sight @ (body.translation - truth.translation))
     assert abs(np.median(shift)) < 0.0003
-
-
-@pytest.mark.parametrize("plane", [None, np.array([0.0, -1.0, 0.0, 0.1])])
-def test_one_depth_everywhere_gives_a_finite_body(plane: np.ndarray | None) -> None:
-    fit = surface_fit.fit(FLAT, square_mask(30, 40), CAMERA, options=FitOptions(plane=plane))
-    assert np.isfinite(fit.superquadric.to_flat()).all()
-    assert fit.status in (Status.WEAK, Status.FAILED, Status.CONVERGED)
-
-
-def test_noise_images_give_a_finite_body(rng: np.random.Generator) -> None:
-    depth = rng.uniform(0.1, 5.0, FLAT.shape).astype(np.float32)
-    depth[rng.random(FLAT.shape) < 0.3] = np.nan
-    fit = surface_fit.fit(depth, rng.random(FLAT.shape) < 0.5, CAMERA)
-    assert np.isfinite(fit.superquadric.to_flat()).all()
-    assert np.isfinite([fit.residual, fit.noise, fit.inlier_share]).all()
-
-
-def test_a_mask_that_fills_the_image() -> None:
-    fit = surface_fit.fit(FLAT, np.ones(FLAT.shape, bool), CAMERA)
-    assert np.isfinite(fit.superquadric.to_flat()).all()
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 3), (3, 480)])
@@ -405,16 +342,6 @@ def test_a_narrow_mask_is_no_line(width: int) -> None:
     assert surface_fit.fit(depth, mask, camera).status != Status.FAILED
 
 
-def test_an_inverse_of_information_is_a_covariance(rng: np.random.Generator) -> None:
-    """One direction known 10^10 times as well as another that is known from the prior alone."""
-    axes, _ = np.linalg.qr(rng.normal(size=(11, 11)))
-    values = np.r_[1e20, 1e12, np.full(9, 1.0)]
-    found = quality._inverse((axes * values) @ axes.T, 1.0)
-    deviations = np.linalg.eigvalsh((found + found.T) / 2)
-    assert deviations.min() > -1e-12
-    assert deviations.max() <= 1 + 1e-9
-
-
 def test_misuse_raises() -> None:
     mask = square_mask(30, 40)
     body = Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
@@ -435,7 +362,7 @@ def test_misuse_raises() -> None:
         surface_fit.fit(np.full_like(FLAT, np.nan), mask, CAMERA)
     with pytest.raises(ValueError, match="nothing to fit"):
         surface_fit.fit(FLAT, np.zeros_like(mask), CAMERA)
-    for wrong in ({"noise": -1.0}, {"plane": np.zeros(4)}, {"pixels": 3}, {"time_budget": 0.0}):
+    for wrong in ({"noise": -1.0}, {"noise": np.inf}, {"plane": np.zeros(4)}, {"pixels": 3}, {"time_budget": 0.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             FitOptions(**wrong)  # type: ignore[arg-type]
 
@@ -465,16 +392,16 @@ def test_recorded_box_on_a_table(shared_data: Path) -> None:
 
 HARD_SENSOR = {
     "wrong order of the axes, half again as deep": [
-        [0.0572, 0.1074, 0.0585, 0.3235, 0.2392, -0.2553, -0.0206, 1.4608, 0.8913, -0.3293, 0.1179, 0.2886]
+        0.0572, 0.1074, 0.0585, 0.3235, 0.2392, -0.2553, -0.0206, 1.4608, 0.8913, -0.3293, 0.1179, 0.2886
     ],
     "a slab taken for a block": [
-        [0.0375, 0.1122, 0.1108, 0.2937, 0.4964, 0.328, 0.1772, 1.4751, 0.5716, -0.6366, -0.4077, -0.319]
+        0.0375, 0.1122, 0.1108, 0.2937, 0.4964, 0.328, 0.1772, 1.4751, 0.5716, -0.6366, -0.4077, -0.319
     ],
     "a slab far away": [
-        [0.1124, 0.0872, 0.0347, 0.6613, 0.3403, -0.2296, -0.3932, 2.1054, -0.1787, -0.1988, -0.8346, 0.4816]
+        0.1124, 0.0872, 0.0347, 0.6613, 0.3403, -0.2296, -0.3932, 2.1054, -0.1787, -0.1988, -0.8346, 0.4816
     ],
     "a stick with a square end": [
-        [0.0326, 0.0326, 0.0921, 0.3072, 0.5984, -0.3748, 0.0872, 1.8106, 0.0852, 0.7379, 0.4299, 0.5132]
+        0.0326, 0.0326, 0.0921, 0.3072, 0.5984, -0.3748, 0.0872, 1.8106, 0.0852, 0.7379, 0.4299, 0.5132
     ],
 }
 
@@ -485,13 +412,12 @@ def test_hard_bodies_through_a_sensor(name: str) -> None:
     focal = 320 / np.tan(np.deg2rad(30))
     camera = Camera(640, 480, focal, focal, 319.5, 239.5)
     rng = np.random.default_rng(5)
-    for flat in HARD_SENSOR[name]:
-        body = Superquadric.from_flat(np.array(flat))
-        depth, index = raycast.render(body, camera)
-        mask = index >= 0
-        depth = np.where(mask, depth, np.nan)
-        noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
-        assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.85
+    body = Superquadric.from_flat(np.array(HARD_SENSOR[name]))
+    depth, index = raycast.render(body, camera)
+    mask = index >= 0
+    depth = np.where(mask, depth, np.nan)
+    noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
+    assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.85
 
 
 @pytest.mark.parametrize("seed", [6, 11])
