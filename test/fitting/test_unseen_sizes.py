@@ -1,19 +1,24 @@
-"""What tells the size that a camera did not see: symmetry of revolution, a prediction, and how much was seen at all."""
+"""Sizes that a camera did not see: what revolution, a prediction and a plane tell, what border and rounding leave."""
 
 import math
 
 import numpy as np
 import pytest
-from table_scenes import Table
+from table_scenes import VGA, Table
 
 from sq_perception.fitting import surface_fit
+from sq_perception.fitting.cost import Ray
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.options import MODEL_ERROR, FitOptions
+from sq_perception.fitting.priors import HullPrior
 from sq_perception.fitting.quality import Alternative, seen_extents, spread
-from sq_perception.fitting.surface_fit import FitOptions
+from sq_perception.fitting.valleys import faces_camera
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast
+from sq_perception.geometry.union import DIRECTIONS
+from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import plane_depth
 
@@ -177,3 +182,99 @@ def test_a_hidden_foot_is_thought_to_reach_the_plane() -> None:
     fit = surface_fit.fit(depth.astype(np.float32), mask & ~hidden, CAMERA, options=settings)
     lowest = NORMAL @ fit.superquadric.translation + PLANE[3] - extent(fit.superquadric, NORMAL)
     assert abs(lowest) < 0.006
+
+
+CAN = (0.035, 0.035, 0.06), (0.1, 1.0)
+BALL = (0.04, 0.04, 0.04), (1.0, 1.0)
+
+
+def lower_half(size, shape, seed, as_thing=False, dark=0) -> tuple[Superquadric, Fit]:
+    """A body of which the image shows the lower half, and its fit; of a thing, a hull is predicted that ends there.
+
+    Above the image are ``dark`` rows without readings, as rectified ones have them.
+    """
+    table = Table(pitch=np.random.default_rng(seed).uniform(0.5, 1.1))
+    body = table.body(0, 0, size, shape)
+    depth, labels = table.see([body], noise=0.0007, seed=seed)
+    rows = np.flatnonzero((labels == 1).any(axis=1))
+    first = int(0.5 * (rows[0] + rows[-1]))
+    depth[first - dark : first], labels[first - dark : first] = np.nan, 0
+    first -= dark
+    camera = VGA.cropped(0, first, VGA.width, VGA.height - first)
+    options = FitOptions(plane=table.plane)
+    if as_thing:
+        shown = table.body(0, 0, (*size[:2], 0.65 * size[2]), shape)
+        support = DIRECTIONS @ shown.translation + shown.support(DIRECTIONS)
+        hull = HullPrior(DIRECTIONS, support, 0.003**2 * np.eye(len(support)), 2 * max(size[:2]))
+        options = FitOptions(plane=table.plane, model_error=MODEL_ERROR, hull=hull)
+    return body, surface_fit.fit(depth[first:], labels[first:] == 1, camera, options=options)
+
+
+@pytest.mark.parametrize("dark", [0, 20])
+@pytest.mark.parametrize("as_thing", [False, True])
+@pytest.mark.parametrize("seed", range(8))
+def test_a_can_may_be_longer_than_the_search_made_it(seed: int, as_thing: bool, dark: int) -> None:
+    body, fit = lower_half(*CAN, seed, as_thing, dark)
+    along = int(np.argmax(np.abs(fit.superquadric.rotation_matrix.T @ body.rotation_matrix[:, 2])))
+    error = abs(fit.superquadric.size[along] - body.size[2])
+    assert error < 3 * fit.sigma_size[along]
+    assert fit.status == Status.WEAK or error < 0.1 * body.size[2]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_curvature_of_a_ball_tells_how_large_it_is(seed: int) -> None:
+    body, fit = lower_half(*BALL, seed)
+    assert fit.status == Status.CONVERGED
+    np.testing.assert_allclose(fit.superquadric.size, body.size, rtol=0.03)
+
+
+def test_one_depth_in_common_makes_a_face(rng: np.random.Generator) -> None:
+    step = 1 / 256
+    rays = np.zeros((1000, len(Ray)))
+    rays[:, Ray.DEPTH] = np.round(rng.uniform(0.2, 0.8, 1000) / step) * step
+    assert not faces_camera(rays, step)
+    rays[:100, Ray.DEPTH] = 128 * step
+    assert faces_camera(rays, step)
+
+
+@pytest.mark.parametrize("hidden", [30, 45, 65])
+@pytest.mark.parametrize("spin", [0.2, 0.7])
+def test_the_hidden_half_size_of_a_face_lies_within_its_deviation(hidden: float, spin: float) -> None:
+    body = Superquadric(
+        np.array([60, 40, hidden]) / 255, [0.12, 0.15], [0.5, 0.5, 0.5], [0.0, 0.0, np.sin(spin), np.cos(spin)]
+    )
+    depth, _ = raycast.render(body, unit_cube.camera())
+    grey = unit_cube.grey_from_depth(depth)
+    fit = surface_fit.fit(unit_cube.depth_from_grey(grey), grey > 0, unit_cube.camera())
+    along = int(np.argmax(np.abs(fit.superquadric.rotation_matrix[2])))
+    error = abs(fit.superquadric.size[along] - hidden / 255)
+    assert error < 2.5 * fit.sigma_size[along]
+    assert fit.sigma_size[along] > 3 * np.delete(fit.sigma_size, along).max()
+
+
+def test_where_two_faces_are_seen_nothing_is_open() -> None:
+    body = Superquadric([0.2, 0.15, 0.25], [0.12, 0.15], [0.5, 0.5, 0.5], [0.35, 0.3, 0.1, 0.85])
+    depth, _ = raycast.render(body, unit_cube.camera())
+    grey = unit_cube.grey_from_depth(depth)
+    fit = surface_fit.fit(unit_cube.depth_from_grey(grey), grey > 0, unit_cube.camera())
+    assert (fit.sigma_size < 0.01 * fit.superquadric.size).all()
+    np.testing.assert_allclose(np.sort(fit.superquadric.size), [0.15, 0.2, 0.25], rtol=0.01)
+
+
+def test_a_body_that_passes_readings_at_more_than_half_a_step_is_not_the_last() -> None:
+    body = unit_cube.optical_from_cube(
+        Superquadric(
+            [0.160507, 0.150236, 0.170657],
+            [0.884777, 0.915079],
+            [0.379145, 0.402456, 0.529095],
+            [-0.671346, 0.200430, -0.628333, -0.338112],
+        )
+    )
+    depth, _ = raycast.render(body, unit_cube.camera())
+    grey = unit_cube.grey_from_depth(depth)
+    measured = unit_cube.depth_from_grey(grey)
+    fit = surface_fit.fit(measured, grey > 0, unit_cube.camera())
+    passed, _ = raycast.render(fit.superquadric, unit_cube.camera())
+    beyond = np.abs(passed - measured)[grey > 0] > 0.6 / 255
+    assert np.mean(beyond) < 0.01
+    assert volume_iou(fit.superquadric, body) > 0.98
