@@ -214,17 +214,6 @@ def test_demo_without_ros_says_what_is_missing(monkeypatch, capsys):
     assert "demo needs ROS 2 in Python: pip install" in capsys.readouterr().err
 
 
-def test_author_renders(shared_data, tmp_path):
-    """The renders of the thesis' author come back with IoU above 0.97 (8 bit depth)."""
-    out = tmp_path / "out.json"
-    folder = shared_data / "author_renders"
-    assert recover(*sorted(folder.glob("*.bmp")), "--json", out) == 0
-    rows = np.loadtxt(folder / "labels.txt", delimiter=",", skiprows=1, usecols=range(1, 22))
-    found = [body_of(frame["superquadrics"][0]) for frame in strict(out.read_text())["frames"]]
-    truth = Superquadric(rows[:, 0:3] / 255, rows[:, 3:5], rows[:, 5:8] / 255, rows[:, -4:])
-    assert (thesis_iou(Superquadric.stack(found), truth) > 0.97).all()
-
-
 def test_a_file_that_is_called_like_the_standard_output_is_no_output(tmp_path, monkeypatch, capsys):
     """It is read where masks or the files of a bag are."""
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((30, 40), np.uint16))

@@ -202,15 +202,3 @@ def test_names_that_no_file_can_have_are_named(tmp_path):
         read(tmp_path / "depth.txt")
     with pytest.raises(ValueError, match="projection"):
         read(tmp_path / "eight.png", projection="fisheye")
-
-
-def test_shared_recordings_are_read(shared_data):
-    for path in sorted((shared_data / "frames").glob("*.npz")):
-        frame = read(path)
-        assert frame.depth.shape == (480, 640)
-        assert frame.labels is not None
-        assert frame.labels.max() >= 1
-    for path in sorted((shared_data / "author_renders").glob("*.bmp")):
-        frame = read(path, projection="orthographic")
-        assert frame.depth.shape == (256, 256)
-        assert np.isfinite(frame.depth).any()

@@ -49,15 +49,6 @@ def test_three_objects_on_a_table(noise):
     assert found.plane[3] == pytest.approx(PLANE[3], abs=0.002)
 
 
-def test_height_is_positive_above_the_table():
-    depth, truth = scene(THREE)
-    plane = segment(depth, CAMERA).plane
-    points = CAMERA.points(depth)
-    height = points @ plane[:3] + plane[3]
-    assert np.median(height[truth > 0]) > 0.03
-    assert np.nanmax(np.abs(height[truth == 0])) < 0.003
-
-
 def test_an_object_before_another_is_cut_at_the_depth_jump():
     bodies = [TABLE.body(0, 0.2, (0.12, 0.03, 0.1), (0.2, 0.2)), TABLE.body(0, 0.0, (0.05, 0.03, 0.08), (0.2, 0.2))]
     depth, truth = scene(bodies, noise=0.001)
@@ -86,26 +77,6 @@ def test_options_choose():
     near = segment(depth, CAMERA, SegmentationOptions(depth_range=(0.0, 1.0)))
     assert near.ids
     assert np.nanmax(depth[near.labels > 0]) <= 1.0
-
-
-@pytest.mark.parametrize(
-    "depth",
-    [
-        table_depth().astype(np.float32),
-        np.full((240, 320), np.nan, np.float32),
-        np.zeros((240, 320), np.float32),
-        np.full((240, 320), np.inf, np.float32),
-        np.full((240, 320), 1.5, np.float32),
-        -np.ones((240, 320), np.float32),
-    ],
-    ids=["empty table", "NaN", "zero", "inf", "wall", "negative"],
-)
-def test_nothing_to_find(depth):
-    found = segment(depth, CAMERA)
-    assert found.ids == ()
-    assert not found.labels.any()
-    assert found.labels.shape == depth.shape
-    np.testing.assert_array_equal(from_labels(np.zeros(depth.shape, int), depth, CAMERA).ids, ())
 
 
 def test_labels_that_would_become_others_are_refused():
