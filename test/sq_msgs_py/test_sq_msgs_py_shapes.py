@@ -10,7 +10,6 @@ pytest.importorskip("shape_msgs", reason="message packages missing: install the 
 
 from shape_msgs.msg import SolidPrimitive
 
-from sq_msgs_py import shapes
 from sq_msgs_py.shapes import BOX, CYLINDER, SPHERE, Primitive, enclosing_factor, mesh_message, primitive, primitives
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, mesh
 from sq_perception.geometry.superquadric import Superquadric
@@ -79,13 +78,6 @@ def test_messages_have_the_order_of_dimensions_that_shape_msgs_asks_for():
     assert can.dimensions[SolidPrimitive.CYLINDER_HEIGHT] == pytest.approx(0.18)
     assert can.dimensions[SolidPrimitive.CYLINDER_RADIUS] == pytest.approx(0.04)
     assert ball.dimensions[SolidPrimitive.SPHERE_RADIUS] == pytest.approx(0.1)
-
-
-@pytest.mark.parametrize("e", [0.1, 0.7, 0.999999, 1.0, 1.000001, 1.5, 2.0])
-def test_the_largest_is_that_of_a_fine_search(e):
-    u = np.linspace(0, 1, 200001)
-    values = 0.3 * u**e + 0.5 * (1 - u) ** e
-    assert shapes._largest(0.3, 0.5, e) == pytest.approx(values.max(), rel=1e-6)
 
 
 def test_solids_enclose_their_bodies_and_touch_them():

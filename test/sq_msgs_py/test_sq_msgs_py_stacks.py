@@ -206,13 +206,6 @@ def test_a_round_body_at_rest_is_sent_once():
     assert scene.changes(swapped, HEADER) == [], "a quarter turn of a box whose edges swap is the same box"
 
 
-@pytest.mark.parametrize(("package", "make"), [("vision_msgs", detections), ("moveit_msgs", collision_objects)])
-def test_without_the_package_only_the_call_fails(monkeypatch, package, make):
-    soft_messages.remove(monkeypatch, package)
-    with pytest.raises(ImportError):
-        make(three(), HEADER)
-
-
 @pytest.mark.parametrize("normal", [[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, -1, 0], [0.1, -0.8, -0.59]])
 def test_a_plane_is_a_pose_on_it_with_z_along_its_normal(normal: list[float]) -> None:
     """And moves with its frame: heights of points stay what they are."""

@@ -148,15 +148,6 @@ def test_a_moved_body_is_the_same_in_another_place(rng):
     assert np.abs(error_of(tracks[0], truth)[0][:3]).max() < 0.04
 
 
-def test_a_body_set_down_at_once_does_not_run_on(rng):
-    """20 cm in a fifth of a second, then at rest, 10 frames a second: no velocity is made up, no id lost."""
-    tracker = Tracker()
-    for k in range(10):
-        tracks = tracker.update([draw(body(centre=(0.2 * (k > 5), 0, 0.8)), noise(), rng)], 0.25 * k)
-        assert [t.id for t in tracks] == [1]
-        assert not tracks[0].velocity.any()
-
-
 def test_a_hidden_body_does_not_lend_its_id_to_its_like(rng):
     """Two cans of a kind: one is hidden, then a third comes into view at some distance."""
     hidden, wall = body(), body((0.2, 0.2, 0.01), (0.1, 0.1), (0, 0, 0.5), (0, 0, 0))
@@ -221,14 +212,15 @@ def test_another_body_elsewhere_is_another_one_and_a_long_gap_forgets_the_pose_a
 
 
 def test_a_motion_of_the_world_changes_nothing(rng):
-    """All poses moved rigidly: the same numbers, moved."""
+    """All poses moved rigidly: the same numbers, moved, also of a first look that leaves one direction open."""
     turn, shift = quaternions.random(1, rng)[0], np.array([1.0, -2.0, 0.5])
     truths = spread_bodies(4, rng)
     here, there = Tracker(), Tracker()
     for k in range(12):
         pose = looking_at(truths.translation.mean(axis=0), np.array([np.sin(0.2 * k), 0.3, -np.cos(0.2 * k)]), 2.0)
         shown = truths if k != 6 else truths[:3]
-        seen = [from_camera(draw(t, correlated(rng), rng), *pose) for t in shown]
+        loose = np.diag([0.0] * 7 + [(k == 0) * 0.02**2] + [0.0] * 3)
+        seen = [from_camera(draw(t, correlated(rng) + loose, rng), *pose) for t in shown]
         matrix = np.eye(4)
         matrix[:3, :3] = quaternions.to_matrix(quaternions.multiply(turn, pose[0]))
         matrix[:3, 3] = quaternions.to_matrix(turn) @ pose[1] + shift
@@ -239,20 +231,6 @@ def test_a_motion_of_the_world_changes_nothing(rng):
             np.testing.assert_allclose(state.difference(carried.to_flat(), b.superquadric.to_flat()), 0, atol=1e-7)
             expected = state.rotate(a.covariance, quaternions.to_matrix(turn))
             np.testing.assert_allclose(b.covariance, expected, atol=1e-9)
-
-
-def test_a_turn_of_the_world_changes_no_second_look(rng):
-    """The first look leaves one direction of the centre open, the second one does not: whatever the world's axes."""
-    turn, here, there = quaternions.random(1, rng)[0], Tracker(), Tracker()
-    loose, sure = noise(), noise()
-    loose[7, 7] = 0.02**2
-    for k in range(6):
-        seen = [draw(body(), loose if k == 0 else sure, rng, form=0)]
-        (one,), (other,) = here.update(seen, 0.1 * k), there.update(seen, 0.1 * k, (turn, np.zeros(3)))
-        carried = one.superquadric.transformed(turn, np.zeros(3))
-        np.testing.assert_allclose(state.difference(carried.to_flat(), other.superquadric.to_flat()), 0, atol=1e-9)
-        expected = state.rotate(one.covariance, quaternions.to_matrix(turn))
-        np.testing.assert_allclose(other.covariance, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("speed", [0.4, 0.6, 0.7, 0.8, 0.95])
