@@ -103,8 +103,7 @@ def test_hull_points_span_the_hull() -> None:
 
 
 def test_a_thing_shows_no_more_than_it_would_alone() -> None:
-    scene = household_things.scene(0, None, 5)
-    shares = [placed.visible_share for placed in scene.placed]
+    shares = [placed.visible_share for placed in household_things.scene(0, None, 5).placed]
     assert len(shares) == 5
     assert 0 <= min(shares) < 1
     assert max(shares) <= 1

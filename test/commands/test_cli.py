@@ -307,8 +307,7 @@ def test_a_cloud_becomes_a_line_and_json(whole: Path, tmp_path: Path, capsys: py
 
 
 def test_meshes_and_arrays_are_read_and_parts_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    mesh = trimesh.creation.cylinder(radius=0.03, height=0.1)
-    mesh.export(tmp_path / "can.obj")
+    trimesh.creation.cylinder(radius=0.03, height=0.1).export(tmp_path / "can.obj")
     np.save(tmp_path / "cloud.npy", BODY.sample_surface(1000, np.random.default_rng(1)))
     assert main.main(["fit", str(tmp_path / "can.obj"), str(tmp_path / "cloud.npy"), "--most", "3", "--json", "-"]) == 0
     found = json.loads(capsys.readouterr().out)["files"]

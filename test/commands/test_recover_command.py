@@ -421,8 +421,7 @@ def test_a_workspace_may_have_no_end(tmp_path, lowest):
     for _ in range(2):
         assert len(recover(tmp_path, tmp_path / "a.npz", *box)[0]["superquadrics"]) == 2
     options = json.loads((tmp_path / "out.jsonl").read_text().splitlines()[0])["options"]
-    expected = [-1, None if "-inf" in lowest else -1, float(lowest[2]), 1, 1, None]
-    assert options["workspace"] == expected
+    assert options["workspace"] == [-1, None if "-inf" in lowest else -1, float(lowest[2]), 1, 1, None]
 
 
 def test_a_message_is_one_printable_line(capsys):

@@ -81,8 +81,7 @@ def test_links_and_devices_are_written_through(tmp_path, option):
 @pytest.mark.parametrize("option", ["--json", "--jsonl", "--mcap", "--pictures", "--meshes"])
 def test_what_cannot_be_written_is_known_before_a_frame_is_computed(tmp_path, option, monkeypatch, capsys):
     monkeypatch.setattr(Recoverer, "recover", None)
-    frame = save_npz(tmp_path / "a.npz")
-    assert run(frame, option, "/proc/sys/out.mcap") == 2
+    assert run(save_npz(tmp_path / "a.npz"), option, "/proc/sys/out.mcap") == 2
     assert option in capsys.readouterr().err
 
 

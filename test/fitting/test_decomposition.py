@@ -50,8 +50,7 @@ def test_a_hammer_is_a_handle_and_a_head() -> None:
 
 def test_one_body_stays_one() -> None:
     for k, shape in enumerate([[0.1, 0.1], [1.0, 1.0], [0.2, 1.0]]):
-        parts = sq.decompose(surface([body([0.04, 0.05, 0.07], shape, [0, 0, 0])], 2000, k))
-        assert len(parts) == 1
+        assert len(sq.decompose(surface([body([0.04, 0.05, 0.07], shape, [0, 0, 0])], 2000, k))) == 1
 
 
 def test_most_bounds_the_number_and_the_same_comes_again() -> None:

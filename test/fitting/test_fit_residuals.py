@@ -87,8 +87,7 @@ def test_point_residuals_and_derivatives(taper, stage, shape, rng) -> None:
 @pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
 def test_point_residuals_on_the_axes(stage: int, rng: np.random.Generator) -> None:
     body = random_body(rng)
-    axes = np.concatenate([np.eye(3), -np.eye(3)]) * body.size * 1.02
-    points = np.asarray(body.to_parent(axes))
+    points = np.asarray(body.to_parent(np.concatenate([np.eye(3), -np.eye(3)]) * body.size * 1.02))
     function = statement.classic if stage == CLASSIC else statement.sampson
     expected = expected_sums(body, lambda moved: function(moved, torch.tensor(points)) / SIGMA)
     assert_same(stage, rays_to(points, pinhole=True), NO_RAYS, PLAIN, body, expected)
@@ -144,8 +143,7 @@ def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random
     cost = evaluate(RENDERED, rays, NO_RAYS, terms, state.parameters, state.rotation, rays[:, Ray.DEPTH].copy(), sums)
     assert cost > 0
     assert np.isfinite(cost)
-    gradient = sums[STEP_LENGTH, :STEP_LENGTH]
-    assert gradient[:3].min() < 0, "growing the body must lower the cost"
+    assert sums[STEP_LENGTH, :STEP_LENGTH][:3].min() < 0, "growing the body must lower the cost"
 
 
 def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
@@ -169,8 +167,7 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
     square = float(statement.leaning(as_torch(body), target).square().sum()) * 9
     rest = terms._replace(plane_stiffness=0.0, rest_stiffness=3.0)
     _, matrix = expected_sums(body, lambda moved: 3 * statement.leaning(moved, target) / np.sqrt(1 + square))
-    scaled = matrix.copy()
-    assert_same(SAMPSON, NO_RAYS, NO_RAYS, rest, body, (np.log1p(square), scaled))
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, rest, body, (np.log1p(square), matrix.copy()))
 
     even = PLAIN._replace(proportion_stiffness=2.0)
     assert_same(
@@ -201,8 +198,7 @@ def test_a_body_above_the_plane_pays_nothing(rng: np.random.Generator) -> None:
 
 
 def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
-    sphere = Superquadric([0.05] * 3, [1.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
-    state = State.of(sphere)
+    state = State.of(Superquadric([0.05] * 3, [1.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0]))
     rays = rays_to(np.array([[0.0, 0.0, 0.44]]), pinhole=False)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     residual = 0.01 / SIGMA
@@ -211,18 +207,15 @@ def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
         met = rays[:, Ray.DEPTH].copy()
         cost = evaluate(SAMPSON, rays, NO_RAYS, terms, state.parameters, state.rotation, met, sums)
         assert cost == pytest.approx(loss)
-    distance = surface_distance(rays, state.parameters, state.rotation)
-    assert distance[0] == pytest.approx(0.01)
+    assert surface_distance(rays, state.parameters, state.rotation)[0] == pytest.approx(0.01)
 
 
 def test_cost_never_rises_and_reaches_the_truth(rng: np.random.Generator) -> None:
     truth = random_body(rng)
-    points = truth.sample_surface(300, rng)
-    rays = rays_to(points, pinhole=False)
+    rays = rays_to(truth.sample_surface(300, rng), pinhole=False)
     limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
     step = rng.normal(0, 0.15, STEP_LENGTH) * np.r_[np.ones(5), [0.1] * 3, np.ones(3), [0.0] * 2]
-    moved = statement.moved(as_torch(truth), torch.tensor(step))
-    flat = np.asarray(moved.to_numbers().numpy())
+    flat = np.asarray(statement.moved(as_torch(truth), torch.tensor(step)).to_numbers().numpy())
     flat[3:5] = np.clip(flat[3:5], 0.1, 1.0)
     state = State.of(Superquadric.from_flat(flat))
     costs = []

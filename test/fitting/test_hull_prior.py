@@ -48,8 +48,7 @@ def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rn
 
 def test_a_bottle_is_as_long_wide_and_high_as_its_hull_is_predicted() -> None:
     up = np.array([0.0, -0.8, -0.6])
-    axes = np.stack([[1.0, 0.0, 0.0], np.cross(up, [1.0, 0.0, 0.0]), up], axis=1)
-    turn = rotation.from_matrix(axes)
+    turn = rotation.from_matrix(np.stack([[1.0, 0.0, 0.0], np.cross(up, [1.0, 0.0, 0.0]), up], axis=1))
     parts = [
         Superquadric(np.array(size), np.array([0.2, 0.6]), np.array([0.0, 0.0, 0.6]) + height * up, turn)
         for size, height in (((0.045, 0.03, 0.05), 0.05), ((0.035, 0.024, 0.02), 0.11), ((0.015, 0.015, 0.03), 0.15))
@@ -146,8 +145,7 @@ def box_from_the_front() -> tuple[np.ndarray, np.ndarray, Superquadric, np.ndarr
     noise = np.random.default_rng(5).normal(0, 0.002, shown.shape)
     # Round corners and a bulge, as no superquadric has them.
     bulge = 0.004 * np.cos(np.linspace(-1.5, 1.5, shown.shape[1]))[None]
-    depth = np.where(mask, shown + noise - bulge, 1.5).astype(np.float32)
-    return depth, mask, body, plane
+    return np.where(mask, shown + noise - bulge, 1.5).astype(np.float32), mask, body, plane
 
 
 @pytest.mark.parametrize("deep", [0.02, 0.03, 0.05])
@@ -159,8 +157,7 @@ def test_a_prediction_tells_the_depth_behind_a_front(box_from_the_front, deep) -
     found = surface_fit.fit(depth, mask, CAMERA, options=options)
     reach = found.superquadric.support(np.array([[0.0, 0.0, 1.0]]))[0]
     assert reach == pytest.approx(float(told_body.support(np.array([[0.0, 0.0, 1.0]]))[0]), abs=0.007)
-    height = found.superquadric.support(plane[None, :3])[0]
-    assert height == pytest.approx(0.06, abs=0.005)
+    assert found.superquadric.support(plane[None, :3])[0] == pytest.approx(0.06, abs=0.005)
 
 
 def test_a_vague_prediction_leaves_the_size_open(box_from_the_front) -> None:

@@ -74,8 +74,7 @@ def test_a_fit_is_surer_the_less_noise_there_is() -> None:
 @pytest.mark.parametrize("shape", [(48, 48), (5, 300), (299, 4), (121, 7), (3, 3)])
 def test_images_of_any_shape(shape: tuple[int, int], rng: np.random.Generator) -> None:
     depth = (1 + 0.01 * rng.standard_normal(shape)).astype(np.float32)
-    found = observation.estimate_noise(depth, np.ones(shape, dtype=bool), 1e-6)
-    assert 0 < found.sigma < 0.1
+    assert 0 < observation.estimate_noise(depth, np.ones(shape, dtype=bool), 1e-6).sigma < 0.1
 
 
 def test_outliers_do_not_count(rng: np.random.Generator) -> None:
@@ -124,8 +123,7 @@ def test_what_is_seen_of_a_small_near_body_is_what_is_seen_of_a_large_far_one() 
         tiny = surface_fit.fit(depth * np.float32(small), mask, scene.camera, options=FitOptions(plane=nearer))
         order, other = np.argsort(large.superquadric.size), np.argsort(tiny.superquadric.size)
         size = large.superquadric.size[order]
-        off = np.abs(tiny.superquadric.size[other] / small - size)
-        assert (off < 0.1 * size).all()
+        assert (np.abs(tiny.superquadric.size[other] / small - size) < 0.1 * size).all()
 
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)

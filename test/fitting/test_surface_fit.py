@@ -124,8 +124,7 @@ def test_damaged_images(damage: str, seed: int) -> None:
     else:
         depth = np.where(mask, depth, np.float32(1.0))
         mask = cv2.dilate(mask.astype(np.uint8), square) > 0
-    fit = surface_fit.fit(depth, mask, unit_cube.camera())
-    assert iou(fit, truth) > 0.93
+    assert iou(surface_fit.fit(depth, mask, unit_cube.camera()), truth) > 0.93
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -136,8 +135,7 @@ def test_a_nearer_body_hides_a_part(seed: int) -> None:
     columns = np.flatnonzero(mask.any(axis=0))
     hidden = np.arange(CAMERA.width) < columns[int(0.2 * len(columns))]
     depth[:, hidden] = 0.2
-    fit = surface_fit.fit(depth, mask & ~hidden, CAMERA)
-    assert iou(fit, truth) > 0.85
+    assert iou(surface_fit.fit(depth, mask & ~hidden, CAMERA), truth) > 0.85
 
 
 @pytest.mark.parametrize("form", range(8))
@@ -167,13 +165,11 @@ def test_the_best_of_several_starts_wins() -> None:
     depth = unit_cube.depth_from_grey(image)
     fit = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=[nonsense, truth])
     assert iou(fit, truth) > 0.99
-    rescued = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=nonsense)
-    assert iou(rescued, truth) > 0.98
+    assert iou(surface_fit.fit(depth, image > 0, unit_cube.camera(), start=nonsense), truth) > 0.98
 
 
 def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
-    truth = thesis_body(np.random.default_rng(8))
-    image = thesis_image(truth)
+    image = thesis_image(thesis_body(np.random.default_rng(8)))
     upright, turned = fit_grey(image), fit_grey(np.ascontiguousarray(np.rot90(image)))
     assert np.sort(turned.superquadric.size) == pytest.approx(np.sort(upright.superquadric.size), rel=0.01)
     about_view = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])
@@ -185,8 +181,7 @@ def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_mirrored_camera_and_another_unit_change_no_body(seed: int) -> None:
     """Costs are in units of the noise, so that neither metres nor the side of the image count."""
-    truth = pinhole_body(np.random.default_rng(40 + seed))
-    depth, mask = pinhole_image(truth)
+    depth, mask = pinhole_image(pinhole_body(np.random.default_rng(40 + seed)))
     depth = depth + np.random.default_rng(seed).normal(0, 0.002, depth.shape).astype(np.float32)
     options = FitOptions(model_error=0.0, noise=0.002)
     size = np.sort(surface_fit.fit(depth, mask, CAMERA, options=options).superquadric.size)
@@ -243,8 +238,7 @@ def test_bodies_on_a_table_do_not_sink_into_it(seed: int) -> None:
     fit = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane))
     assert iou(fit, truth) > 0.88
     body = fit.superquadric
-    lowest = plane[:3] @ body.translation + plane[3] - body.support(plane[None, :3])[0]
-    assert lowest > -0.003
+    assert (plane[:3] @ body.translation + plane[3] - body.support(plane[None, :3])[0]) > -0.003
     assert np.abs(plane[:3] @ body.rotation_matrix).max() > 0.995
 
 
@@ -374,8 +368,7 @@ def test_author_renders(shared_data: Path) -> None:
         values = np.array([float(x) for x in numbers])
         truth = Superquadric(values[0:3] / 255, values[3:5], values[5:8] / 255, values[17:21])
         image = cv2.imread(str(shared_data / "author_renders" / name), cv2.IMREAD_GRAYSCALE)
-        fit = fit_grey(image)
-        assert iou(fit, unit_cube.optical_from_cube(truth)) > 0.99
+        assert iou(fit_grey(image), unit_cube.optical_from_cube(truth)) > 0.99
 
 
 def test_recorded_box_on_a_table(shared_data: Path) -> None:

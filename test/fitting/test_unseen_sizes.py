@@ -61,14 +61,12 @@ def test_a_bottle_that_no_superquadric_explains_is_as_deep_as_it_is_wide() -> No
 
 
 def test_what_is_seen_to_be_square_is_not_round() -> None:
-    fit = fitted(standing([0.05, 0.05, 0.06], [0.1, 0.1], 0.6))
-    assert fit.superquadric.shape.max() < 0.5
+    assert fitted(standing([0.05, 0.05, 0.06], [0.1, 0.1], 0.6)).superquadric.shape.max() < 0.5
 
 
 def test_an_oval_that_shows_both_of_its_sides_stays_oval() -> None:
     fit = fitted(standing([0.06, 0.03, 0.04], [0.3, 1.0], 0.6))
-    size = np.sort(fit.superquadric.size)
-    np.testing.assert_allclose(size, [0.03, 0.04, 0.06], rtol=0.12)
+    np.testing.assert_allclose(np.sort(fit.superquadric.size), [0.03, 0.04, 0.06], rtol=0.12)
 
 
 def test_how_open_a_free_body_is_counts_by_its_share_and_along_the_axes_it_shares() -> None:
@@ -90,10 +88,8 @@ def test_a_depth_that_only_roundness_tells_is_open_unless_the_body_explains_what
     """A can's mantle tells its depth; what is left of a bottle beside its body leaves it to the odds of roundness."""
     foot = standing([0.04, 0.04, 0.06], [0.1, 1.0])
     neck = Superquadric([0.015, 0.015, 0.11], [0.1, 1.0], foot.translation + 0.05 * NORMAL, foot.rotation)
-    bottle = fitted(Superquadric.stack([foot, neck]), seed)
-    assert bottle.status is Status.WEAK
-    can = fitted(standing([0.035, 0.035, 0.06], [0.1, 1.0]), seed)
-    assert can.status is Status.CONVERGED
+    assert fitted(Superquadric.stack([foot, neck]), seed).status is Status.WEAK
+    assert fitted(standing([0.035, 0.035, 0.06], [0.1, 1.0]), seed).status is Status.CONVERGED
 
 
 # A prediction
@@ -171,8 +167,7 @@ def test_a_can_from_above_shows_all_of_its_width() -> None:
 
 
 def test_a_hidden_foot_is_thought_to_reach_the_plane() -> None:
-    truth = standing([0.04, 0.03, 0.07], [0.1, 0.1], 0.4)
-    shown, _ = raycast.render(truth, CAMERA)
+    shown, _ = raycast.render(standing([0.04, 0.03, 0.07], [0.1, 0.1], 0.4), CAMERA)
     mask = np.isfinite(shown)
     depth = np.where(mask, shown, plane_depth(PLANE, CAMERA))
     rows = np.flatnonzero(mask.any(axis=1))
@@ -247,8 +242,7 @@ def test_the_hidden_half_size_of_a_face_lies_within_its_deviation(hidden: float,
     grey = unit_cube.grey_from_depth(depth)
     fit = surface_fit.fit(unit_cube.depth_from_grey(grey), grey > 0, unit_cube.camera())
     along = int(np.argmax(np.abs(fit.superquadric.rotation_matrix[2])))
-    error = abs(fit.superquadric.size[along] - hidden / 255)
-    assert error < 2.5 * fit.sigma_size[along]
+    assert abs(fit.superquadric.size[along] - hidden / 255) < 2.5 * fit.sigma_size[along]
     assert fit.sigma_size[along] > 3 * np.delete(fit.sigma_size, along).max()
 
 
@@ -275,6 +269,5 @@ def test_a_body_that_passes_readings_at_more_than_half_a_step_is_not_the_last() 
     measured = unit_cube.depth_from_grey(grey)
     fit = surface_fit.fit(measured, grey > 0, unit_cube.camera())
     passed, _ = raycast.render(fit.superquadric, unit_cube.camera())
-    beyond = np.abs(passed - measured)[grey > 0] > 0.6 / 255
-    assert np.mean(beyond) < 0.01
+    assert np.mean(np.abs(passed - measured)[grey > 0] > 0.6 / 255) < 0.01
     assert volume_iou(fit.superquadric, body) > 0.98

@@ -101,8 +101,7 @@ def test_rays_meet_the_body_where_they_meet_a_dense_mesh() -> None:
         for share in np.linspace(0.3, 0.999, 60):
             before = camera.points(np.where(hit, share * depth, share * 0.6))
             assert (body.gauge(before.reshape(-1, 3)) >= 1 - 1e-9).all()
-        surface = mesh(body, 96)
-        distance, _ = cKDTree(surface.sample(100000, seed=0)).query(points[::10])
+        distance, _ = cKDTree(mesh(body, 96).sample(100000, seed=0)).query(points[::10])
         assert distance.max() < 0.03 * body.size.max()
 
 

@@ -84,8 +84,7 @@ def test_a_vessel_has_walls_that_are_taken_at_the_rim(world_of, picking):
     cup = Superquadric.stack([Superquadric([0.045, 0.045, 0.04], [0.1, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])])
     hollow = Superquadric([[0.042, 0.042, 0.074]], [[0.1, 1.0]], [[0.0, 0.0, 0.04]], [[0.0, 0.0, 0.0, 1.0]])
     thing = world_module.Thing(cup, 0.6, "cup", hollow)
-    solids = thing.solids()
-    inside = np.concatenate(solids)
+    inside = np.concatenate(thing.solids())
     inside = inside[inside[:, 2] > 0.0]
     assert np.hypot(*inside[:, :2].T).min() > 0.04
     assert np.ptp(inside[:, :2], axis=0) == pytest.approx([0.09, 0.09], abs=2e-3)

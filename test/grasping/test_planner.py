@@ -171,8 +171,7 @@ def test_the_hand_stands_farther_from_the_side_that_is_less_sure():
     spread = sure(1, sigma=1e-5)
     half, place = 0.5 * (0.001**2 + 0.006**2), 0.5 * (0.001**2 - 0.006**2)
     spread[0][np.ix_([1, 6], [1, 6])] = 0.5 * np.array([[half, place], [place, half]])
-    body = standing([0.05, 0.015, 0.06], [0.1, 0.1])
-    planned = plan(body, covariance=spread, placement=0.0).grasps
+    planned = plan(standing([0.05, 0.015, 0.06], [0.1, 0.1]), covariance=spread, placement=0.0).grasps
     found = [grasp for grasp in planned if abs(closing_line(grasp)[1]) > 0.99]
     assert found
     for grasp in found:
@@ -350,8 +349,7 @@ def test_a_doubtful_body_with_few_ways_is_planned_in_an_image_too():
     """All ways are looked at in the first round, so that none is left for the second."""
     around = Surroundings(depth=np.full((48, 64), 0.5), camera=CAMERA)
     body = Superquadric([0.038, 0.2, 0.2], [0.1, 0.1], [0.0, 0.0, 0.8], UPRIGHT)
-    found = plan(body, around=around, covariance=sure(1, sigma=0.006)).grasps
-    assert 0 < found[0].score < 0.5
+    assert 0 < plan(body, around=around, covariance=sure(1, sigma=0.006)).grasps[0].score < 0.5
 
 
 def test_a_plan_moves_with_the_scene():

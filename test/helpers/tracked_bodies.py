@@ -101,8 +101,7 @@ def from_camera(seen, rotation, position):
 def looking_at(target, direction, distance):
     """Pose of a camera that looks at a point from a direction."""
     forward = -direction / np.linalg.norm(direction)
-    helper = np.array([0, 1.0, 0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0, 0])
-    right = np.cross(helper, forward)
+    right = np.cross(np.array([0, 1.0, 0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0, 0]), forward)
     right /= np.linalg.norm(right)
     matrix = np.stack([right, np.cross(forward, right), forward], axis=1)
     return quaternions.from_matrix(matrix), target - distance * forward

@@ -126,8 +126,7 @@ class TestLeastSquares:
         narrow, wide = (body(a, 0.2, 0.2, 0.1, 0.1, 0.5, 0.5, 0.5, *IDENTITY) for a in (0.2, 0.4))
         steps = torch.linspace(0.05, 0.95, 19, dtype=DOUBLE)
         lines = torch.cartesian_prod(steps, steps)
-        seen = (lines - 0.5).abs().amax(dim=-1) < 0.18
-        depth = torch.where(seen, 0.7, 0.0)[None].double()
+        depth = torch.where((lines - 0.5).abs().amax(dim=-1) < 0.18, 0.7, 0.0)[None].double()
         for box in (narrow, wide):
             assert losses.least_squares_loss(box, lines, depth).item() < 2e-4
         assert losses.free_space_loss(narrow, lines, depth).item() < 1e-6
@@ -271,8 +270,7 @@ def test_gradients_are_finite_on_axes(shape: float, sharpness: float | None) -> 
 
 class TestLines:
     def test_pixels_lie_where_the_canonical_view_says(self) -> None:
-        view = torch.arange(16.0).reshape(1, 4, 4)
-        lines, values = soft_render.of_view(view, 2, row=1, column=0)
+        lines, values = soft_render.of_view(torch.arange(16.0).reshape(1, 4, 4), 2, row=1, column=0)
         assert values.tolist() == [[4, 6, 12, 14]]
         assert lines.tolist() == [[0.125, 0.625], [0.625, 0.625], [0.125, 0.125], [0.625, 0.125]]
 

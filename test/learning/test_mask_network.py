@@ -52,8 +52,7 @@ def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Gene
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert records[-1]["outliers"] == pytest.approx(1, abs=0.1)
     assert records[-1]["left"] < records[-1]["outliers"]
-    again = checkpoint.load_masks(tmp_path / "run" / "masks.safetensors")
-    assert again.config == SMALL == network.config
+    assert checkpoint.load_masks(tmp_path / "run" / "masks.safetensors").config == SMALL == network.config
 
 
 def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(tmp_path, rng, monkeypatch) -> None:

@@ -205,8 +205,7 @@ class TestCheckpoint:
 
     def test_files_from_before_there_were_backbones(self, tmp_path: Path) -> None:
         path = tmp_path / "m.safetensors"
-        model = Regressor(COMPACT)
-        checkpoint.save(path, model, dtype=np.float32)
+        checkpoint.save(path, Regressor(COMPACT), dtype=np.float32)
         header, state = checkpoint.read_header(path), load_file(str(path))
         config = json.loads(header["config"])
         for name in ("backbone", "framing"):

@@ -144,16 +144,14 @@ class TestSchedule:
         """With a rate of almost nothing there is no progress, and a run of a million steps ends soon."""
         config = replace(RUN, schedule="plateau", learning_rate=1e-12, steps=10**6, validation=2, batch=4, average=0.0)
         train.train(config, tmp_path, SMALL)
-        records = log_of(tmp_path)
-        assert 42 <= records[-1]["step"] < 120
+        assert 42 <= log_of(tmp_path)[-1]["step"] < 120
 
 
 class TestLearning:
     def test_learns(self, tmp_path: Path) -> None:
         views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
         before = train.validate(Regressor(SMALL), views, truth).mean()
-        model = train.train(RUN, tmp_path, SMALL)
-        assert train.validate(model, views, truth).mean() > before + 0.05
+        assert train.validate(train.train(RUN, tmp_path, SMALL), views, truth).mean() > before + 0.05
         assert [record["step"] for record in log_of(tmp_path)] == [20, 40]
 
     @pytest.mark.parametrize("loss", ["dual", "render"])
@@ -296,10 +294,8 @@ class TestContinuation:
     def test_start_from_a_file_keeps_its_form_and_learns_what_hidden_means(self, tmp_path: Path) -> None:
         checkpoint.save(tmp_path / "start.safetensors", Regressor(SMALL))
         config = replace(RUN, steps=2, start=str(tmp_path / "start.safetensors"), occluded_share=0.5, noisy_share=0.5)
-        model = train.train(config, tmp_path / "run")
-        assert model.config == replace(SMALL, marks_hidden=True)
-        record = log_of(tmp_path / "run")[-1]
-        assert {"iou", "iou_hidden", "iou_worn"} <= set(record)
+        assert train.train(config, tmp_path / "run").config == replace(SMALL, marks_hidden=True)
+        assert {"iou", "iou_hidden", "iou_worn"} <= set(log_of(tmp_path / "run")[-1])
 
     @pytest.mark.parametrize("other", [{"pixels": 48}, {"backbone": "resnet18"}, {"framing": "full"}])
     def test_a_start_of_another_form_than_is_asked_for_is_refused(self, other: dict[str, Any], tmp_path: Path) -> None:

@@ -362,8 +362,7 @@ class TestSeveralCameras:
         Tf2(monkeypatch, look_up)
         bench = make_bench(namespaces=("front", "wrist")).active()
         bench.answer("wrist")
-        box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
-        bench.set(bench.nodes[1], target_frame="base", workspace=box)
+        bench.set(bench.nodes[1], target_frame="base", workspace=[-1.0, -1.0, 0.0, 1.0, 1.0, 2.0])
         bench.publish("wrist")
         bench.until(waits.is_set)
         assert bench.answer("front") == 1.0

@@ -466,8 +466,7 @@ def test_a_reliability_that_was_asked_for_stays(make_bench, asked):
 def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
     bench = make_bench()
     bench.peer.destroy_publisher(bench.infos)
-    latched = bench.peer.create_publisher(CameraInfo, "depth/camera_info", latched_qos())
-    latched.publish(bench.info())
+    bench.peer.create_publisher(CameraInfo, "depth/camera_info", latched_qos()).publish(bench.info())
     bench.until(lambda: len(bench.node._input._infos) == 1)
     assert len(bench.answer(bench.depth())[1]) == 1
 

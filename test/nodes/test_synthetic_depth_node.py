@@ -155,8 +155,7 @@ def test_a_node_replays_what_a_folder_holds(tmp_path):
     heard = {"depth/camera_info": [], "mask/image": [], "depth/image": []}
     for topic, kind in (("depth/camera_info", CameraInfo), ("mask/image", Image), ("depth/image", Image)):
         bench.peer.create_subscription(kind, f"/{topic}", heard[topic].append, 10)
-    node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
-    bench.spin([node])
+    bench.spin([SyntheticDepthNode("synthetic_depth_node", context=bench.context)])
     with bench:
         bench.until(lambda: all(len(messages) > 2 for messages in heard.values()))
         assert {message.encoding for message in heard["mask/image"]} == {"32SC1"}

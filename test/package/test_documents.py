@@ -112,8 +112,7 @@ def test_the_site_loads_nothing_from_elsewhere_and_links_to_files_that_are_there
         found = Loads()
         found.feed(page.read_text(encoding="utf-8"))
         assert found.loaded
-        outside = [one for one in found.loaded if re.match(r"(\w+:)?//", one)]
-        assert not outside, page.name
+        assert not [one for one in found.loaded if re.match(r"(\w+:)?//", one)], page.name
         if page.name == "404.html":  # addressed from the root, wherever it is shown
             continue
         for address in (one for one in (*found.loaded, *found.linked) if not re.match(r"\w+:|//|#", one)):

@@ -94,8 +94,7 @@ def test_the_readme_runs_as_it_stands(repository: Path, tmp_path: Path) -> None:
     assert all(body["grasps"] for body in grasps)
     assert (tmp_path / "pictures" / "table.png").is_file()
 
-    script = snippets(repository / "README.md")[0]
-    said = run_python("-c", script, cwd=tmp_path).stdout
+    said = run_python("-c", snippets(repository / "README.md")[0], cwd=tmp_path).stdout
     assert re.findall(r"^(\d) (converged|weak): full edges \[.*\] mm \+- \[.*\] mm$", said, re.MULTILINE), said
     assert (tmp_path / "table.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "table.glb").read_bytes()[:4] == b"glTF"

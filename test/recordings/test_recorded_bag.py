@@ -306,8 +306,7 @@ def test_images_without_a_stamp_have_no_mask(tmp_path, grey):
 
 def test_masks_that_are_ignored_are_not_read(tmp_path, grey):
     """As a coloured picture of segments on a topic of that name."""
-    colour = image(grey, 1, "rgb8")
-    path = write(tmp_path / "bag", [*recording(grey, 1), ("/mask/image", 1, colour)])
+    path = write(tmp_path / "bag", [*recording(grey, 1), ("/mask/image", 1, image(grey, 1, "rgb8"))])
     (refused,) = frames(path)
     assert "got 'rgb8'" in str(refused)
     (frame,) = frames(path, reading=Reading(ignore_masks=True))
@@ -538,8 +537,7 @@ def test_broken_bags_cost_the_exit_code_and_nothing_else(tmp_path, grey, capsys)
     bag = write(tmp_path / "bag", [*contents, (TOPIC, 3, image(grey, 3, "16UC1"))])
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(lone(bag).read_bytes()[:-50])
-    found = recover(tmp_path, cut, bag, code=1)
-    assert [frame["stamp"]["sec"] for frame in found] == [1, 3]
+    assert [frame["stamp"]["sec"] for frame in recover(tmp_path, cut, bag, code=1)] == [1, 3]
     errors = capsys.readouterr().err
     assert f"{cut}: not a readable bag" in errors
     assert f"{TOPIC} recorded at 2.000000000" in errors

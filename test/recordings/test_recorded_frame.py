@@ -98,8 +98,7 @@ def test_grey_images_are_views_of_the_cube(tmp_path, suffix):
     np.testing.assert_array_equal(np.isfinite(frame.depth), np.isfinite(depth))
     seen = np.isfinite(depth)
     assert np.abs(frame.depth[seen] - depth[seen]).max() <= 0.5 / 255 + 1e-6
-    fine = unit_cube.grey_from_depth(depth, np.uint16)
-    cv2.imwrite(str(tmp_path / "fine.png"), fine)
+    cv2.imwrite(str(tmp_path / "fine.png"), unit_cube.grey_from_depth(depth, np.uint16))
     found = read(tmp_path / "fine.png", projection="orthographic").depth
     np.testing.assert_allclose(found[seen], depth[seen], atol=1 / 65535)
 

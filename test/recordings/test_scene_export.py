@@ -91,8 +91,7 @@ def test_mujoco_reads_what_was_written(tmp_path: Path, form: str, meshes: bool) 
             first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
             hull = trimesh.Trimesh(model.mesh_vert[first : first + count] @ turn.T + place).convex_hull
             normals, offsets = hull.face_normals, np.einsum("ij,ij->i", hull.face_normals, hull.triangles[:, 0])
-            out = (points_of(body, rng) @ normals.T - offsets).max()
-            assert -2e-3 < out < 1e-6
+            assert -2e-3 < (points_of(body, rng) @ normals.T - offsets).max() < 1e-6
             continue
         np.testing.assert_allclose(place, solid.position, atol=PRECISION)
         np.testing.assert_allclose(turn, rotation.to_matrix(solid.rotation), atol=PRECISION)

@@ -45,8 +45,7 @@ def test_processes_answer_as_this_one_does(crops):
 
 def test_a_mask_without_readings_has_no_body(crops):
     (depth, camera, mask, _), *_ = crops
-    empty = np.full_like(depth, np.nan)
-    assert sq.recover_crops([empty], camera, [mask], OPTIONS) == [None]
+    assert sq.recover_crops([np.full_like(depth, np.nan)], camera, [mask], OPTIONS) == [None]
     assert sq.recover_crops([], camera) == []
 
 

@@ -16,8 +16,7 @@ TABLE = Table()
 def two_boxes() -> tuple[list[seen_object.SeenObject], Fit]:
     """A box with one of the same width on it, seen as two objects, and the exact body of the lower one."""
     lower = TABLE.body(0, 0, (0.05, 0.04, 0.03))
-    upper = TABLE.body(0, 0, (0.05, 0.04, 0.02), height=0.06)
-    depth, labels = TABLE.see([lower, upper])
+    depth, labels = TABLE.see([lower, TABLE.body(0, 0, (0.05, 0.04, 0.02), height=0.06)])
     objects = seen_object.objects(depth, FrameEvidence(labels, (1, 2)), VGA)
     return objects, Fit(lower.canonical_form(), 0.0, Status.CONVERGED, "converged", covariance=1e-6 * np.eye(11))
 
@@ -76,8 +75,7 @@ def test_a_fragment_is_no_body_has_no_pixels_and_is_said(likely, affinity, is_ke
     depth, truth = table.see([table.body(0.0, 0.0, (0.06, 0.05, 0.05))], 1e-3)
     columns = np.flatnonzero((truth == 1).any(axis=0))
     labels = truth.astype(np.int32)
-    strip = np.arange(depth.shape[1]) < columns[0] + 4
-    labels[(truth == 1) & strip] = 2
+    labels[(truth == 1) & (np.arange(depth.shape[1]) < columns[0] + 4)] = 2
     evidence = FrameEvidence(
         labels, (1, 2), objectness=(0.99, likely), membership=np.ones(labels.shape, np.float32),
         affinity=affinity * (1 - np.eye(2)),

@@ -144,13 +144,10 @@ def test_a_frame_with_masks_keeps_their_values_and_order(symmetry):
 
 
 def test_the_rendering_of_a_recovery_is_the_image(symmetry):
-    bodies = random_bodies(1, 3)
-    depth, labels = seen(bodies, CAMERA, background=1.4)
-    found = symmetry.recover(depth, CAMERA, labels)
-    rendered, index = render_recovery(found, CAMERA)
+    depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
+    rendered, index = render_recovery(symmetry.recover(depth, CAMERA, labels), CAMERA)
     assert np.mean((index >= 0) == (labels > 0)) > 0.995
-    both = (index >= 0) & (labels > 0)
-    assert np.median(np.abs(rendered - depth)[both]) < 0.002
+    assert np.median(np.abs(rendered - depth)[(index >= 0) & (labels > 0)]) < 0.002
     assert set(np.unique(index)) == {-1, 0}
 
 
@@ -195,8 +192,7 @@ def test_a_mask_of_which_next_to_nothing_was_measured_shows_no_body(method):
     ],
 )
 def test_images_without_objects_say_why(method, image, why):
-    camera = Camera(64, 48, 60.0, 60.0, 32, 24)
-    found = Recoverer(method=method).recover(image, camera)
+    found = Recoverer(method=method).recover(image, Camera(64, 48, 60.0, 60.0, 32, 24))
     assert found.bodies == ()
     assert why in found.message
     assert found.labels.shape == (48, 64)
@@ -296,19 +292,16 @@ def test_no_depth_value_raises(method, projection, weights):
 
 def test_images_whose_columns_lie_in_a_row_are_put_in_order_before_kernels_see_them(symmetry):
     """Kernels are compiled for arrays of a kind; for another one the first frame would wait for a compiler."""
-    scene = table_scene(np.random.default_rng(3), 1, CAMERA)
-    depth, labels = scene.render()
+    depth, labels = table_scene(np.random.default_rng(3), 1, CAMERA).render()
     usual, turned = symmetry.recover(depth, CAMERA), symmetry.recover(np.asfortranarray(depth), CAMERA)
     assert symmetry.read(np.asfortranarray(depth), CAMERA).depth.flags.c_contiguous
     np.testing.assert_array_equal(usual.labels, turned.labels)
-    given = symmetry.recover(depth, CAMERA, np.asfortranarray(labels))
-    assert given.labels.flags.c_contiguous
+    assert symmetry.recover(depth, CAMERA, np.asfortranarray(labels)).labels.flags.c_contiguous
 
 
 def test_what_is_out_of_range_of_an_object_is_not_measured(symmetry):
     """Its near edge is cut off by the range: as if the sensor had lost it, and no free space before the rest."""
-    scene = table_scene(np.random.default_rng(3), 1, CAMERA)
-    depth, labels = scene.render()
+    depth, labels = table_scene(np.random.default_rng(3), 1, CAMERA).render()
     depth = depth.astype(np.float32)
     cut = float(np.quantile(depth[labels > 0], 0.3))
     lost = np.where((labels > 0) & (depth < cut), np.float32(np.nan), depth)
@@ -327,8 +320,7 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     assert small.sum() > 200
     found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
     assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
-    given = FrameEvidence(small, (1,), Plane(scene.plane, 1.0, 1e-3))
-    (obj,) = seen_object.objects(depth, given, CAMERA)
+    (obj,) = seen_object.objects(depth, FrameEvidence(small, (1,), Plane(scene.plane, 1.0, 1e-3)), CAMERA)
     whole = seen_object.complete(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()
     assert (whole.mask & ~obj.mask).any() == (pixels > 0)

@@ -66,8 +66,7 @@ def test_a_plane_of_any_direction():
     tilt = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     shift = np.array([0.1, -0.2, 0.9])
     moved = {label: points @ tilt.T + shift for label, points in found.items()}
-    plane = np.append(tilt[:, 2], -tilt[:, 2] @ shift)
-    assert container_walls.walls(moved, plane) == {1, 2, 3, 4}
+    assert container_walls.walls(moved, np.append(tilt[:, 2], -tilt[:, 2] @ shift)) == {1, 2, 3, 4}
 
 
 def test_two_walls_of_a_corner_and_walls_cut_into_pieces():

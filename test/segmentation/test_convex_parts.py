@@ -96,9 +96,8 @@ def behind_a_post(tilt=0.0, between=0.5):
     v, u = np.indices(depth.shape)
     x = (u - CAMERA.cx) / CAMERA.fx
     parts = [(u > 90) & (u < 140), (u > 180) & (u < 230), (u >= 140) & (u <= 180)]
-    start = (180 - CAMERA.cx) / CAMERA.fx * 0.7
     # A point (x z, y z, z) of the turned part: z - 0.7 = tan(tilt) (x z - start).
-    turned = (0.7 - np.tan(tilt) * start) / (1 - np.tan(tilt) * x)
+    turned = (0.7 - np.tan(tilt) * ((180 - CAMERA.cx) / CAMERA.fx * 0.7)) / (1 - np.tan(tilt) * x)
     for k, (where, z) in enumerate(zip(parts, (0.7, turned, between), strict=True)):
         here = where & (v > 80) & (v < 160)
         depth, labels = np.where(here, z, depth), np.where(here, k + 1, labels)

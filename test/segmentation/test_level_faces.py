@@ -46,8 +46,7 @@ def test_a_bare_carton_stays_one():
 def supported(depth):
     """The support of an image, and its depth with 0 where there is none."""
     valid = np.isfinite(depth)
-    known = np.where(valid, depth, np.float32(0))
-    return support_plane.support(depth, valid, VGA), known
+    return support_plane.support(depth, valid, VGA), np.where(valid, depth, np.float32(0))
 
 
 def faces(labels, known, support):
@@ -67,8 +66,7 @@ def test_the_face_is_that_of_the_carton(seed):
     ((label, face),) = faces(labels, known, support).items()
     assert label == 1
     assert face.equation[:3] @ table.plane[:3] > np.cos(np.deg2rad(1))
-    middle = table.origin + TOP * table.plane[:3]
-    assert face.height(middle) == pytest.approx(0, abs=2e-3)
+    assert face.height(table.origin + TOP * table.plane[:3]) == pytest.approx(0, abs=2e-3)
     points = level_faces.samples(labels, known, VGA, 1)[1]
     above = level_faces.find_above(1, points, face, labels, known, VGA)
     assert above[truth == 1].all()

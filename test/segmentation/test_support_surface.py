@@ -129,8 +129,7 @@ def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
     v, u = np.indices(table.shape)
     board = (np.abs(u - 160) < 80) & (np.abs(v - 120) < 60)
     things = [np.hypot(u - x, v - 120) < 15 for x in (125, 195)]
-    depth = table - 0.006 * board - 0.03 * (things[0] | things[1])
-    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    found = segment(noisy(table - 0.006 * board - 0.03 * (things[0] | things[1]), 1e-3, seed), CAMERA)
     assert min(best_iou(thing, found.labels) for thing in things) > 0.8
 
 
@@ -138,8 +137,7 @@ def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
 def test_a_carton_that_the_border_cuts_is_no_furniture(away):
     """Its front fills a quarter of the image, more than a plane needs, and is most of that plane."""
     normal = slanted(45)
-    ahead = np.cross([1.0, 0.0, 0.0], normal)
-    foot = np.array([0.0, 0.0, 0.35 / np.sin(np.deg2rad(45))]) + away * ahead
+    foot = np.array([0.0, 0.0, 0.35 / np.sin(np.deg2rad(45))]) + away * np.cross([1.0, 0.0, 0.0], normal)
     carton = Superquadric(np.array([0.1, 0.04, 0.15]), np.full(2, 0.1), foot + 0.15 * normal, frame_of(normal))
     depth, truth = with_bodies(plane_image(normal, 0.35), [carton])
     assert truth[0].any()
@@ -195,8 +193,7 @@ def room_corner():
     ahead = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     left = (ahead + np.array([1.0, 0, 0])) / np.sqrt(2)
     right = (ahead - np.array([1.0, 0, 0])) / np.sqrt(2)
-    walls = [plane_image(-down, 1.0), plane_image(-left, 1.6), plane_image(-right, 1.6)]
-    return np.min(walls, axis=0)
+    return np.min([plane_image(-down, 1.0), plane_image(-left, 1.6), plane_image(-right, 1.6)], axis=0)
 
 
 def test_a_room_corner_holds_no_objects():
@@ -316,8 +313,7 @@ def test_the_largest_edge_is_that_of_the_box_and_not_its_diagonal(turn):
     points = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     up = np.array([0.0, 0.0, 1.0])
     assert largest_edge(points, up) == pytest.approx(0.4, rel=0.08)
-    wild = np.concatenate([points, [[5.0, 5.0, 5.0]]])
-    assert largest_edge(wild, up) == pytest.approx(0.4, rel=0.08)
+    assert largest_edge(np.concatenate([points, [[5.0, 5.0, 5.0]]]), up) == pytest.approx(0.4, rel=0.08)
 
 
 def test_a_narrower_frame_shows_the_same_table(shared_data):

@@ -107,8 +107,7 @@ def test_what_stands_apart_behind_a_post_stays_apart():
     """Two boxes in one plane with the table visible between them."""
     bodies = [TABLE.body(x, 0.15, (0.04, 0.03, 0.05)) for x in (-0.1, 0.1)]
     bodies.append(TABLE.body(0, 0, (0.012, 0.012, 0.1)))
-    found = segment(TABLE.see(bodies)[0], VGA)
-    assert len(found.ids) == 3
+    assert len(segment(TABLE.see(bodies)[0], VGA).ids) == 3
 
 
 def bowl(depth, truth, label, radius, thickness, rim, camera=VGA):
@@ -159,8 +158,7 @@ def test_the_largest_of_many_is_found_among_low_ones():
 
 
 def test_touching_bodies_without_a_table():
-    bodies = PARTED["can before a box"]
-    depth, truth = TABLE.see(bodies, 0.001, table=False)
+    depth, truth = TABLE.see(PARTED["can before a box"], 0.001, table=False)
     found = judged_by_network(depth, VGA)
     assert found.plane is None
     assert len(found.ids) == 2

@@ -110,8 +110,7 @@ def test_alignment_keeps_planes_and_points_leave_gaps_in_finer_images() -> None:
     true = plane_depth(PLANE, finer)
     known = np.isfinite(points)
     np.testing.assert_allclose(points[known], true[known], rtol=0.01)  # half a pixel away
-    same = stages.align(plane(), CAMERA, np.zeros(3), CAMERA, True)
-    np.testing.assert_array_equal(same, plane())
+    np.testing.assert_array_equal(stages.align(plane(), CAMERA, np.zeros(3), CAMERA, True), plane())
 
 
 def test_bending_keeps_the_middle_and_grows_with_the_square() -> None:
@@ -151,7 +150,6 @@ def test_cameras_are_drawn_from_the_ranges_and_one_without_stages_changes_nothin
     np.testing.assert_array_equal(Stages().process(image, mask, CAMERA), image)
     mask[20:40, 30:50] = True
     for each in drawn[:40]:
-        found = each.process(image, mask, CAMERA)
-        inside = found[24:36, 34:46]
+        inside = each.process(image, mask, CAMERA)[24:36, 34:46]
         assert np.isfinite(inside).mean() > 0.9
         assert np.nanmax(np.abs(inside / image[24:36, 34:46] - 1)) < 0.02

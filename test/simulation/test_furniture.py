@@ -39,8 +39,7 @@ def test_things_stand_on_the_plane(scene: tuple[str, ThingsOnTable]) -> None:
     for placed in seen.placed:
         assert placed.pixels == np.count_nonzero(seen.labels == placed.label) > 0
         down = placed.parts.support(-seen.plane[None, :3])[:, 0]
-        lowest = placed.parts.translation @ seen.plane[:3] - down + seen.plane[3]
-        assert lowest.min() > -1e-6
+        assert (placed.parts.translation @ seen.plane[:3] - down + seen.plane[3]).min() > -1e-6
 
 
 def test_what_is_no_thing_is_furniture_floor_or_wall(scene: tuple[str, ThingsOnTable]) -> None:

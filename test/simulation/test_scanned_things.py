@@ -82,8 +82,7 @@ def test_views_of_a_mesh_tell_its_hull(folder: Path) -> None:
         if not seen.any():
             continue
         rows, columns = np.nonzero(seen)
-        points = setting.camera.unproject(columns, rows, depth[rows, columns])
-        reach = (points @ DIRECTIONS.T).max(axis=0)
+        reach = (setting.camera.unproject(columns, rows, depth[rows, columns]) @ DIRECTIONS.T).max(axis=0)
         truth = (setting.parts.translation @ DIRECTIONS.T).max(axis=0)
         assert (reach < truth + 1e-4).all()
         assert (truth - reach).min() < 0.005
@@ -95,8 +94,7 @@ def test_half_of_the_views_show_ones_own_things(folder, tmp_path, capsys) -> Non
     views = read_views(THINGS.none, [tmp_path / "views" / "00000.safetensors"])
     drawn = draw_thing_views(40, np.random.default_rng([5, 0]), own=own)
     np.testing.assert_array_equal(views.support, drawn.support)
-    of_mesh = views.kinds == 6
-    assert 8 <= of_mesh.sum() <= 32
+    assert 8 <= (views.kinds == 6).sum() <= 32
     assert np.isfinite(views.support).all()
     assert capsys.readouterr().out.count("views\n") == 1
 

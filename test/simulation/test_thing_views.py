@@ -91,8 +91,7 @@ def test_a_view_is_that_of_a_large_image() -> None:
         fine_view = canonical_view.from_mask(plain, index >= 0, fine, missing_is_hidden=True)
         assert coarse_view.extent == pytest.approx(fine_view.extent, rel=0.06)
         both = (coarse_view.image > 0) & (fine_view.image > 0)
-        either = (coarse_view.image > 0) | (fine_view.image > 0)
-        assert both.sum() > 0.8 * either.sum()
+        assert both.sum() > 0.8 * ((coarse_view.image > 0) | (fine_view.image > 0)).sum()
         assert np.median(np.abs(coarse_view.image - fine_view.image)[both]) < 0.02
         reaches = [support_in_view(setting.parts, view) for view in (coarse_view, fine_view)]
         assert np.abs(reaches[0] - reaches[1]).max() < 0.06
@@ -112,8 +111,7 @@ def test_the_truth_holds_what_the_view_shows() -> None:
         # A view pixel shows the image pixel next to it, so that steep sides are off by about a pixel of either.
         pixel = float(np.median(depth[seen])) / setting.camera.fx / view.extent
         assert ((points @ DIRECTIONS.T).max(axis=0) < reach + 1.5 * pixel + 1 / 48).all()
-        along = np.argmax(DIRECTIONS @ [0.0, 0.0, 1.0])
-        assert reach[along] > -0.02
+        assert reach[np.argmax(DIRECTIONS @ [0.0, 0.0, 1.0])] > -0.02
 
 
 def test_a_mirrored_thing_has_the_mirrored_view() -> None:
@@ -143,8 +141,7 @@ def test_planes_move_into_the_view_with_their_points() -> None:
     depth, seen = alone(setting).render()
     view = canonical_view.from_mask(depth, seen, setting.camera)
     across = np.linalg.svd(setting.table[None, :3])[2][1:]
-    foot = -setting.table[3] * setting.table[:3]
-    points = foot + rng.uniform(-0.1, 0.1, (20, 2)) @ across
+    points = -setting.table[3] * setting.table[:3] + rng.uniform(-0.1, 0.1, (20, 2)) @ across
     matrix = quaternions.to_matrix(view.rotation)
     moved = (points - view.anchor) @ matrix.T / view.extent + [0.5, 0.5, NEAREST]
     plane = view.plane_to_canonical(setting.table)
@@ -270,8 +267,7 @@ def test_what_is_around_a_thing_does_not_go_through_itself() -> None:
     rng = np.random.default_rng(12)
     pairs = 0
     for _ in range(150):
-        setting = draw_setting(draw_thing(rng), rng)
-        others = setting.others
+        others = draw_setting(draw_thing(rng), rng).others
         surfaces = [other.sample_surface(200, rng, oversampling=2) for other in others]
         for i, other in enumerate(others):
             for j, points in enumerate(surfaces):
@@ -293,8 +289,7 @@ def test_truth_is_known_where_something_was_measured(drawn: SegmentViews) -> Non
 
 def test_most_of_a_segment_is_its_object(drawn: SegmentViews) -> None:
     inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
-    own = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
-    assert np.median(own) > 0.85
+    assert np.median((inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))) > 0.85
     assert (drawn.truth[inside] == NO).any()
 
 

@@ -86,8 +86,7 @@ def test_solids_enclose_their_bodies_and_touch_them():
     for one in random_bodies(120):
         solid = primitive(one.size, one.shape)
         kinds.add(solid.kind)
-        over = overshoot(solid, surface(one, rng))
-        assert -0.01 < over <= 1e-12
+        assert -0.01 < overshoot(solid, surface(one, rng)) <= 1e-12
         volume = {BOX: np.prod(2 * one.size)}
         if solid.kind == CYLINDER:
             volume[CYLINDER] = np.pi * solid.dimensions[1] ** 2 * solid.dimensions[0]
@@ -123,8 +122,7 @@ def test_an_octahedron_is_its_own_mesh():
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     assert enclosing_factor(vertices, np.array(faces), SIZE, (2.0, 2.0)) == pytest.approx(1, abs=1e-12)
     # The ball through its six corners reaches sqrt(3) beyond the middle of its faces.
-    factor = enclosing_factor(vertices, np.array(faces), SIZE, (1.0, 1.0))
-    assert factor == pytest.approx(np.sqrt(3))
+    assert enclosing_factor(vertices, np.array(faces), SIZE, (1.0, 1.0)) == pytest.approx(np.sqrt(3))
     with pytest.raises(ValueError, match="outwards"):
         enclosing_factor(vertices, np.array(faces)[:, ::-1], SIZE, (2.0, 2.0))
     with pytest.raises(ValueError, match="outwards"):

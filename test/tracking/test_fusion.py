@@ -142,8 +142,7 @@ def test_no_number_of_views_lessens_what_all_have_in_common(rng, monkeypatch):
     last = np.array([t.sigma_size / t.superquadric.size for t in tracks])
     np.testing.assert_allclose(last, 0.5 * first, rtol=0.2)
     sizes = [np.abs(error_of(t, truth)[0][:3]) for t, truth in zip(tracks, truths, strict=True)]
-    within = np.mean(np.array(sizes) < 2 * last)
-    assert within > 0.9
+    assert np.mean(np.array(sizes) < 2 * last) > 0.9
 
 
 def test_most_of_what_a_prediction_errs_by_is_the_same_from_everywhere(rng):

@@ -52,8 +52,7 @@ def test_ids_survive_a_crossing(same):
             if k == 0:
                 expected = {t.id: order[t.observation] for t in tracks}
             assert {t.id: order[t.observation] for t in tracks} == expected
-        speed = np.linalg.norm(tracks[0].velocity)
-        assert 0.3 < speed < 0.6
+        assert 0.3 < np.linalg.norm(tracks[0].velocity) < 0.6
 
 
 def test_ids_survive_an_occlusion_but_not_an_absence(rng):
