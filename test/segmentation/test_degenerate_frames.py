@@ -16,6 +16,7 @@ with the true support where the frame has one, otherwise the one that was found 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,86 +64,37 @@ def tilted(normal: list[float], away: float) -> np.ndarray:
     return np.append(unit, -unit[2] * away)
 
 
-def blob(camera: Camera, near: float, far: float, rng: np.random.Generator) -> np.ndarray:
-    """A smooth surface between two depths, filling the image."""
-    v, u = np.indices((camera.height, camera.width))
-    x, y = u / camera.width - 0.5, v / camera.height - 0.5
-    waves = sum(
-        rng.uniform(0.3, 1) * np.cos(2 * np.pi * (a * x + b * y) + rng.uniform(0, 2 * np.pi))
-        for a, b in rng.uniform(-1.2, 1.2, (6, 2))
-    )
-    low, high = waves.min(), waves.max()
-    return near + (far - near) * (waves - low) / (high - low)
-
-
-def hand_over_the_lens(seed: int) -> Frame:
+def hand_over_the_lens(seed: int) -> np.ndarray:
     """3 to 8 cm away, with the holes that a sensor leaves below its shortest distance."""
     rng = np.random.default_rng(seed)
-    holes = blob(COARSE, 0.0, 1.0, rng) > 0.7
-    speckles = rng.random((COARSE.height, COARSE.width)) < 0.1
-    depth = blob(COARSE, 0.03, 0.08, rng) + 5e-4 * rng.standard_normal((COARSE.height, COARSE.width))
-    return Frame(np.where(holes | speckles, np.nan, depth).astype(np.float32))
+
+    def waves() -> np.ndarray:
+        """A smooth surface from 0 to 1 that fills the image."""
+        x, y = U / COARSE.width - 0.5, V / COARSE.height - 0.5
+        found = sum(
+            rng.uniform(0.3, 1) * np.cos(2 * np.pi * (a * x + b * y) + rng.uniform(0, 2 * np.pi))
+            for a, b in rng.uniform(-1.2, 1.2, (6, 2))
+        )
+        return (found - found.min()) / np.ptp(found)
+
+    holes, speckles = waves() > 0.7, rng.random(U.shape) < 0.1
+    return np.where(holes | speckles, np.nan, 0.03 + 0.05 * waves() + 5e-4 * rng.standard_normal(U.shape))
 
 
-def box_close_by(degrees: float) -> Frame:
+def box_close_by(degrees: float) -> np.ndarray:
     """A box of 20 cm whose face or edge is 5 cm away, wider than the image."""
     half = np.deg2rad(degrees) / 2
-    turn = np.array([0.0, np.sin(half), 0.0, np.cos(half)])
-    turned = Superquadric(np.full(3, 0.1), np.full(2, 0.1), np.zeros(3), turn)
-    reach = turned.support(np.array([[0.0, 0.0, -1.0]]))[0]
-    body = Superquadric(turned.size, turned.shape, np.array([0.0, 0.0, 0.05 + reach]), turn)
-    depth, _ = raycast.render(body, COARSE)
-    noise = 3e-4 * np.random.default_rng(5).standard_normal(depth.shape)
-    return Frame(np.where(np.isfinite(depth), depth + noise, np.nan).astype(np.float32))
-
-
-def table_cut_by_the_border() -> Frame:
-    """A table of which the lower corner of the image shows a part; nothing behind it is measured."""
-    depth = plane_depth(TABLE, COARSE)
-    v, u = np.indices(depth.shape)
-    return Frame(np.where(u + 2 * v > 210, depth, np.nan).astype(np.float32), support=TABLE)
-
-
-def filled(value: float, camera: Camera = COARSE) -> Frame:
-    return Frame(np.full((camera.height, camera.width), value, np.float32), camera)
-
-
-def holed(kind: str) -> Frame:
-    """A wall at 0.8 m with most of its pixels missing."""
-    v, u = np.indices((COARSE.height, COARSE.width))
-    kept = {
-        "every other pixel": (u + v) % 2 == 0,
-        "squares": (u // 8 + v // 8) % 2 == 0,
-        "a column": u == 50,
-        "a row": v == 38,
-        "a diagonal": u == v,
-        "a pixel": (u == 80) & (v == 60),
-    }[kind]
-    return Frame(np.where(kept, 0.8, np.nan).astype(np.float32))
-
-
-def noise(kind: str) -> Frame:
-    rng = np.random.default_rng(11)
-    shape = COARSE.height, COARSE.width
-    depth = {
-        "uniform": rng.uniform(0.3, 3.0, shape),
-        "salt and pepper": np.where(rng.random(shape) < 0.5, 0.4, 2.0),
-        "extreme": 10.0 ** rng.uniform(-30, 30, shape),
-        "of both signs": rng.standard_normal(shape),
-        "rarely a number": np.where(rng.random(shape) < 0.02, rng.uniform(0.3, 3.0, shape), np.nan),
-    }[kind]
-    return Frame(depth.astype(np.float32))
+    body = Superquadric([0.1] * 3, [0.1] * 2, np.zeros(3), [0.0, np.sin(half), 0.0, np.cos(half)])
+    place = [0.0, 0.0, 0.05 + body.support(np.array([[0.0, 0.0, -1.0]]))[0]]
+    depth, _ = raycast.render(Superquadric(body.size, body.shape, place, body.rotation), COARSE)
+    return np.where(np.isfinite(depth), depth + 3e-4 * np.random.default_rng(5).standard_normal(depth.shape), np.nan)
 
 
 def small(width: int, height: int, shown: str) -> Frame:
     camera = Camera(width, height, 270.0, 270.0, (width - 1) / 2, (height - 1) / 2)
     v, u = np.indices((height, width))
-    depth = {
-        "wall": np.full((height, width), 0.7),
-        "steps": np.where((u // 40 + v) % 2 == 0, 0.5, 0.9),
-        "nothing": np.full((height, width), np.nan),
-    }[shown]
-    return Frame(depth.astype(np.float32), camera)
+    steps = np.where((u // 40 + v) % 2 == 0, 0.5, 0.9)
+    return Frame(np.float32({"wall": 0.7, "steps": steps, "nothing": np.nan}[shown] + np.zeros((height, width))), camera)
 
 
 def room(kind: str, camera: Camera = CAMERA) -> np.ndarray:
@@ -167,31 +119,38 @@ def seen(kind: str, sensor: str, seed: int = 3, camera: Camera = CAMERA) -> Fram
     return Frame(depth, camera, TABLE if "table" in kind else None)
 
 
-HOLED = ("every other pixel", "squares", "a column", "a row", "a diagonal", "a pixel")
-NOISES = ("uniform", "salt and pepper", "extreme", "of both signs", "rarely a number")
+V, U = np.indices((COARSE.height, COARSE.width))
+RNG = np.random.default_rng(11)
+KEPT = {
+    "every other pixel": (U + V) % 2 == 0, "squares": (U // 8 + V // 8) % 2 == 0, "a column": U == 50,
+    "a row": V == 38, "a diagonal": U == V, "a pixel": (U == 80) & (V == 60),
+}  # fmt: skip
+"""What is measured of a wall at 0.8 m."""
+NOISES = {
+    "uniform": RNG.uniform(0.3, 3.0, U.shape),
+    "salt and pepper": np.where(RNG.random(U.shape) < 0.5, 0.4, 2.0),
+    "extreme": 10.0 ** RNG.uniform(-30, 30, U.shape),
+    "of both signs": RNG.standard_normal(U.shape),
+    "rarely a number": np.where(RNG.random(U.shape) < 0.02, RNG.uniform(0.3, 3.0, U.shape), np.nan),
+}
 VALUES = {"NaN": np.nan, "zero": 0.0, "infinite": np.inf, "negative": -1.0, "0.6 m": 0.6}
-SIZES = ((1, 1), (2, 2), (640, 3), (3, 480), (16, 16))
-FRAMES: dict[str, Callable[[], Frame]] = {
-    **{f"all {name}": partial(filled, value) for name, value in VALUES.items()},
-    "table cut by the border": table_cut_by_the_border,
-    **{f"wall, {kind}": partial(holed, kind) for kind in HOLED},
-    **{f"noise, {kind}": partial(noise, kind) for kind in NOISES},
+IMAGES: dict[str, Callable[[], Any]] = {
+    **{f"all {name}": partial(np.full, U.shape, value) for name, value in VALUES.items()},
+    "a table in the lower corner": lambda: np.where(U + 2 * V > 210, plane_depth(TABLE, COARSE), np.nan),
+    **{f"wall, {kind}": partial(np.where, kept, 0.8, np.nan) for kind, kept in KEPT.items()},
+    **{f"noise, {kind}": partial(np.array, image) for kind, image in NOISES.items()},
     **{f"hand over the lens {seed}": partial(hand_over_the_lens, seed) for seed in range(2)},
     **{f"box at 5 cm turned by {degrees} degrees": partial(box_close_by, degrees) for degrees in (0, 45)},
-    **{f"{w} x {h} {shown}": partial(small, w, h, shown) for w, h in SIZES for shown in ("wall", "steps", "nothing")},
 }
+SIZES = ((1, 1), (2, 2), (640, 3), (3, 480), (16, 16))
+SMALL = {f"{w} x {h} {shown}": partial(small, w, h, shown) for w, h in SIZES for shown in ("wall", "steps", "nothing")}
+FRAMES = (*IMAGES, *SMALL)
 
 
-# Masks from outside
-
-
-def whole(frame: Frame) -> np.ndarray:
-    return np.ones(frame.depth.shape, np.int32)
-
-
-def random_pixels(frame: Frame) -> np.ndarray:
-    """Two objects, each a random third of all pixels."""
-    return np.random.default_rng(1).integers(0, 3, frame.depth.shape).astype(np.int32)
+def frame_of(name: str) -> Frame:
+    if name in SMALL:
+        return SMALL[name]()
+    return Frame(IMAGES[name]().astype(np.float32), support=TABLE if "table" in name else None)
 
 
 def random_tiles(frame: Frame) -> np.ndarray:
@@ -201,7 +160,12 @@ def random_tiles(frame: Frame) -> np.ndarray:
     return values[np.ix_(rows, columns)].astype(np.int16)
 
 
-MASKS = {"whole image": whole, "random pixels": random_pixels, "random tiles": random_tiles}
+MASKS = {
+    "whole image": lambda frame: np.ones(frame.depth.shape, np.int32),
+    "random pixels": lambda frame: np.random.default_rng(1).integers(0, 3, frame.depth.shape).astype(np.int32),
+    "random tiles": random_tiles,
+}
+"""Masks from outside."""
 
 
 # What must hold
@@ -279,14 +243,14 @@ def test_masks_in_a_room_without_things_make_no_wild_bodies(recoverer, kind, sen
 
 @pytest.mark.parametrize("name", FRAMES)
 def test_a_frame_of_nothing_has_no_bodies(recoverer: Recoverer, name: str) -> None:
-    frame = FRAMES[name]()
+    frame = frame_of(name)
     check_empty(recoverer.recover(frame.depth, frame.camera), frame)
 
 
 @pytest.mark.parametrize("name", FRAMES)
 @pytest.mark.parametrize("masks", MASKS)
 def test_masks_in_a_frame_of_nothing_make_no_wild_bodies(recoverer: Recoverer, name: str, masks: str) -> None:
-    frame = FRAMES[name]()
+    frame = frame_of(name)
     check(recoverer.recover(frame.depth, frame.camera, MASKS[masks](frame)), frame)
 
 
