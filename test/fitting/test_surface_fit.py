@@ -337,28 +337,23 @@ def test_a_narrow_mask_is_no_line(width: int) -> None:
 
 
 def test_misuse_raises() -> None:
-    mask = square_mask(30, 40)
-    body = Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
-    with pytest.raises(ValueError, match="mask"):
-        surface_fit.fit(FLAT, mask[:100], CAMERA)
-    with pytest.raises(ValueError, match="bool"):
-        surface_fit.fit(FLAT, mask.astype(np.uint8), CAMERA)
-    with pytest.raises(ValueError, match="does not fit a camera"):
-        surface_fit.fit(FLAT[:100], mask[:100], CAMERA)
-    with pytest.raises(ValueError, match="float"):
-        surface_fit.fit(FLAT.astype(np.uint16), mask, CAMERA)
-    for start in ("guess", "", None, 3):
-        with pytest.raises(ValueError, match=f"start: expected .* got {start!r}$"):
-            surface_fit.fit(FLAT, mask, CAMERA, start=start)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="start"):
-        surface_fit.fit(FLAT, mask, CAMERA, start=[body, 3])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match="nothing to fit"):
-        surface_fit.fit(np.full_like(FLAT, np.nan), mask, CAMERA)
-    with pytest.raises(ValueError, match="nothing to fit"):
-        surface_fit.fit(FLAT, np.zeros_like(mask), CAMERA)
+    mask, body = square_mask(30, 40), Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
+    for depth, pixels, words in (
+        (FLAT, mask[:100], "mask"),
+        (FLAT, mask.astype(np.uint8), "bool"),
+        (FLAT[:100], mask[:100], "does not fit a camera"),
+        (FLAT.astype(np.uint16), mask, "float"),
+        (np.full_like(FLAT, np.nan), mask, "nothing to fit"),
+        (FLAT, np.zeros_like(mask), "nothing to fit"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            surface_fit.fit(depth, pixels, CAMERA)
+    for start, got in *((one, f"{one!r}$") for one in ("guess", "", None, 3)), ([body, 3], ""):
+        with pytest.raises(ValueError, match=f"start: expected .* got {got}"):
+            surface_fit.fit(FLAT, mask, CAMERA, start=start)
     for wrong in ({"noise": -1.0}, {"noise": np.inf}, {"plane": np.zeros(4)}, {"pixels": 3}, {"time_budget": 0.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            FitOptions(**wrong)  # type: ignore[arg-type]
+            FitOptions(**wrong)
 
 
 def test_author_renders(shared_data: Path) -> None:

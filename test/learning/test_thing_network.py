@@ -198,11 +198,3 @@ def test_the_shipped_network_says_how_well_it_knows(processed, least, most, monk
     found = shard_training.validate_things(checkpoint.load_things(), held)
     assert found["error"] < 0.09
     assert least < found["ratio"] < most
-
-
-def test_the_shipped_network_says_where_it_comes_from() -> None:
-    header = checkpoint.read_header("things")
-    assert "train-things" in json.loads(header["made"])["command"]
-    assert json.loads(header["training"])["views"] > 0
-    assert json.loads(header.get("metrics") or header["validation"])["error"] > 0
-    assert checkpoint.resolve("things").stat().st_size < 8_000_000

@@ -152,7 +152,11 @@ class TestLearning:
         views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
         before = train.validate(Regressor(SMALL), views, truth).mean()
         assert train.validate(train.train(RUN, tmp_path, SMALL), views, truth).mean() > before + 0.05
-        assert [record["step"] for record in log_of(tmp_path)] == [20, 40]
+        records, header = log_of(tmp_path), checkpoint.read_header(tmp_path / "model.safetensors")
+        assert [record["step"] for record in records] == [20, 40]
+        assert json.loads(header["metrics"])["iou"] == max(record["iou"] for record in records), "the best one is kept"
+        assert json.loads(header["training"])["steps"] == 40
+        assert json.loads(header["made"])["versions"]["torch"]
 
     @pytest.mark.parametrize("loss", ["dual", "render"])
     def test_labels_go_to_the_losses_that_need_them_and_to_no_other(self, loss, tmp_path, monkeypatch) -> None:
@@ -281,15 +285,6 @@ class TestContinuation:
         weight = "size_head.weight"
         torch.testing.assert_close(saved.state_dict()[weight], model.state_dict()[weight], rtol=0, atol=1e-3)
         torch.testing.assert_close(state[f"average.{weight}"], state[f"model.{weight}"])
-
-    def test_best_network_is_kept(self, tmp_path: Path) -> None:
-        train.train(RUN, tmp_path, SMALL)
-        records = log_of(tmp_path)
-        kept = json.loads(checkpoint.read_header(tmp_path / "model.safetensors")["metrics"])
-        assert kept["iou"] == max(r["iou"] for r in records)
-        header = checkpoint.read_header(tmp_path / "model.safetensors")
-        assert json.loads(header["training"])["steps"] == 40
-        assert json.loads(header["made"])["versions"]["torch"]
 
     def test_start_from_a_file_keeps_its_form_and_learns_what_hidden_means(self, tmp_path: Path) -> None:
         checkpoint.save(tmp_path / "start.safetensors", Regressor(SMALL))

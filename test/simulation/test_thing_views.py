@@ -19,7 +19,7 @@ from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
 from sq_perception.simulation.thing_setting import Setting, draw_setting
-from sq_perception.simulation.thing_views import draw_sensor, draw_thing_views, support_in_view
+from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
 
 NOTHING = Superquadric.stack([])
 
@@ -219,30 +219,6 @@ def test_a_view_frames_the_whole_mask_though_not_all_of_it_was_measured(share: f
     of_depth = canonical_view.from_mask(depth, mask & np.isfinite(depth), camera, missing_is_hidden=True)
     assert of_depth.extent == pytest.approx(whole.extent * max(1 - share, 30 / 40), rel=0.02)
     assert not (of_depth.with_steps == COVERED).any()
-
-
-def test_a_shadow_lies_on_one_side() -> None:
-    """Stereo loses the background on the side away from the second eye."""
-    rng = np.random.default_rng(8)
-    found = []
-    for _ in range(30):
-        setting = draw_setting(draw_thing(rng, ["can"]), rng)
-        sensor = draw_sensor(setting.camera, rng)
-        baseline = getattr(sensor, "baseline", 0.0)
-        if not baseline or setting.table is None or len(setting.others):
-            continue
-        depth, mask = setting.render()
-        lost = np.isnan(sensor.measure(depth, setting.camera, rng)) & ~mask
-        # A stereo sensor's own border band is beyond this: between the thing's columns and ten pixels more.
-        rows, columns = np.nonzero(mask)
-        left, right = columns.min(), columns.max()
-        inside = slice(rows.min(), rows.max())
-        sides = lost[inside, max(left - 10, 0) : left].sum(), lost[inside, right : right + 10].sum()
-        if baseline > 0:
-            sides = sides[::-1]
-        found.append(int(sides[1] >= sides[0]))
-    assert len(found) > 3
-    assert np.mean(found) > 0.8
 
 
 def test_what_a_thing_stands_on_touches_it() -> None:
