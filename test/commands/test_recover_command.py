@@ -43,8 +43,7 @@ def body_of(entry):
 
 
 def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
-    names = ["f2.png", "f10.png", "f1.npz", "F3.PNG", "g.png"]
-    for k, name in enumerate(names):
+    for k, name in enumerate(["f2.png", "f10.png", "f1.npz", "F3.PNG", "g.png"]):
         (save_npz if name.endswith("npz") else save_png)(tmp_path / name, *([] if name.endswith("npz") else [500 + k]))
     camera_yaml(tmp_path / "camera.yaml", 300.0)
     (tmp_path / "notes.txt").touch()

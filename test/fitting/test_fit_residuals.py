@@ -143,8 +143,7 @@ def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random
     rim = np.stack([np.cos(angle), np.sin(angle)], 1)
     extent = np.asarray(body.support(np.concatenate([rim, np.zeros((200, 1))], 1)))
     rays = rays_to(np.concatenate([rim * extent[:, None] * 1.01, np.full((200, 1), 0.5)], 1), pinhole=False)
-    terms = PLAIN._replace(outline_stiffness=1 / SIGMA)
-    cost, sums = cost_of(RENDERED, rays, NO_RAYS, terms, body)
+    cost, sums = cost_of(RENDERED, rays, NO_RAYS, PLAIN._replace(outline_stiffness=1 / SIGMA), body)
     assert cost > 0
     assert np.isfinite(cost)
     assert sums[STEP_LENGTH, :STEP_LENGTH][:3].min() < 0, "growing the body must lower the cost"

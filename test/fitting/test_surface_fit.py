@@ -357,8 +357,7 @@ def test_misuse_raises() -> None:
 
 
 def test_author_renders(shared_data: Path) -> None:
-    lines = (shared_data / "author_renders" / "labels.txt").read_text().splitlines()[1:]
-    for line in lines:
+    for line in (shared_data / "author_renders" / "labels.txt").read_text().splitlines()[1:]:
         name, *numbers = line.split(",")
         values = np.array([float(x) for x in numbers])
         truth = Superquadric(values[0:3] / 255, values[3:5], values[5:8] / 255, values[17:21])

@@ -25,8 +25,7 @@ def test_product_is_scipys(quaternions: np.ndarray) -> None:
 
 def test_matrix_round_trip_for_every_largest_component(quaternions: np.ndarray) -> None:
     half_turns = np.eye(4)
-    near_half_turns = half_turns + 1e-9
-    for q in (quaternions, half_turns, near_half_turns):
+    for q in (quaternions, half_turns, half_turns + 1e-9):
         back = rotation.from_matrix(rotation.to_matrix(q))
         np.testing.assert_allclose(
             rotation.geodesic_angle(q / np.linalg.norm(q, axis=-1, keepdims=True), back), 0, atol=1e-7

@@ -120,8 +120,7 @@ def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
 
 
 def test_an_image_without_gaps_or_with_single_ones_as_of_recorded_frames_is_given_back() -> None:
-    single = np.where((ROWS % 8 == 3) & (COLUMNS % 8 == 2), np.float32(np.nan), SLOPE)
-    for image in (SLOPE, single):
+    for image in (SLOPE, np.where((ROWS % 8 == 3) & (COLUMNS % 8 == 2), np.float32(np.nan), SLOPE)):
         assert hole_filling.fill(image) == (image, None, None)
 
 
@@ -145,8 +144,7 @@ def test_what_stands_in_for_missing_lines_shifts_no_body(first: int) -> None:
     depth, labels = table.see(bodies, noise=0.0005)
     whole = Recoverer().recover(depth, VGA, labels)
     depth[first::2] = np.nan
-    frame = Recoverer().recover(depth, VGA, labels)
-    for found, of_all in zip(frame.bodies, whole.bodies, strict=True):
+    for found, of_all in zip(Recoverer().recover(depth, VGA, labels).bodies, whole.bodies, strict=True):
         true = bodies[found.label - 1]
         np.testing.assert_allclose(found.superquadric.translation, true.translation, atol=4e-4)
         assert abs(found.pixels / of_all.pixels - 0.5) < 0.05

@@ -54,10 +54,6 @@ def rvl_message(grey, a=0.0, b=0.0):
     return struct.pack("<iffII", 0, a, b, width, height) + packed_runs(grey)
 
 
-def millimetres(depth):
-    return np.where(np.isfinite(depth), np.round(1e3 * np.nan_to_num(depth)), 0).astype(np.uint16)
-
-
 def test_millimetres_come_back(depth):
     image_format, data = pack(depth)
     assert image_format == "16UC1; compressedDepth png"

@@ -181,8 +181,7 @@ class TestUnitCube:
 
 class TestCanonicalView:
     def test_inverse_is_exact(self) -> None:
-        bodies = tabletop_bodies(30, 5)
-        for body in bodies:
+        for body in tabletop_bodies(30, 5):
             depth, index = raycast.render(body, VGA)
             if (index >= 0).sum() < 50:
                 continue

@@ -13,8 +13,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
 
-from sq_perception import Superquadric
+from sq_perception import Camera, Superquadric
 from sq_perception.commands.demo import match
+from sq_perception.evaluation.recovery_figure import demo_figure
 
 
 def boxes(*centres: float) -> Superquadric:
@@ -60,3 +61,8 @@ def test_ctrl_c_ends_it_without_a_trace(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")
+
+
+def test_a_picture_without_bodies_is_drawn() -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    demo_figure(np.full((48, 64), np.nan), camera, [], {"a": [], "b": []}).canvas.draw()

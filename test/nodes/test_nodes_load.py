@@ -182,8 +182,7 @@ def test_each_of_three_is_killed_and_comes_back_while_the_others_go_on(tmp_path)
     )
     camera = ("objects:=1", "rate:=10.0", f"camera_info_file:={path}")
     with Peer() as peer, Robot(peer, camera) as robot:
-        order = np.random.default_rng(5).permutation([CAMERA_PROCESS, NODE, VIEWER])
-        for member in order:
+        for member in np.random.default_rng(5).permutation([CAMERA_PROCESS, NODE, VIEWER]):
             kill = robot.kill(str(member))
             assert kill.back < 30.0, kill  # the benchmark asks for 5, on a machine that does nothing else
             assert kill.silence < 5.0, kill

@@ -38,8 +38,7 @@ def test_each_crop_gives_its_body(crops):
 def test_processes_answer_as_this_one_does(crops):
     depths, cameras, masks, _ = zip(*crops, strict=True)
     here = sq.recover_crops(depths, cameras, masks, OPTIONS)
-    there = sq.recover_crops(depths, cameras, masks, OPTIONS, jobs=2)
-    for one, other in zip(here, there, strict=True):
+    for one, other in zip(here, sq.recover_crops(depths, cameras, masks, OPTIONS, jobs=2), strict=True):
         np.testing.assert_allclose(one.superquadric.to_flat(), other.superquadric.to_flat(), rtol=1e-6, atol=1e-9)
 
 

@@ -25,8 +25,6 @@ from sq_perception.simulation.scenes import plane_depth
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 TABLE = Table(distance=0.7)
 PLANE = TABLE.plane
-GRAIN = 7
-"""The channel of the log of the pixels to a cell's side."""
 CAN = (0.035, 0.035, 0.05), (0.1, 1.0)
 
 
