@@ -31,7 +31,6 @@ from sq_perception.recordings.inputs import RecordedInput, in_folder
 
 @pytest.fixture
 def validate(repository):
-    """Holds a document against the schema."""
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((repository / "sq_perception" / "recordings" / "result.schema.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)

@@ -42,7 +42,6 @@ def small_network(path: Path, **training: object) -> Path:
 
 
 def entry(name: str, loss: str | None, **changed: float) -> dict[str, Any]:
-    """A contestant of results.json."""
     return {"name": name, "loss": loss, "summary": {**FiguresOfMerit.of(LABELS, LABELS).summary(), **changed}}
 
 

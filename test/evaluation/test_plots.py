@@ -43,7 +43,6 @@ def drawn(figure):
 
 
 def one_picture(inches=(6.4, 4.8)):
-    """A figure and the axes that fill it."""
     figure = plots.new_figure(*inches)
     return figure, figure.add_axes((0, 0, 1, 1))
 

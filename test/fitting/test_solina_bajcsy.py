@@ -81,7 +81,6 @@ def noisy_cloud(seed: int) -> np.ndarray:
 
 
 def cost(fit: Fit, points: np.ndarray) -> float:
-    """What the method minimises."""
     found = fit.superquadric
     residual = np.sqrt(np.prod(found.size)) * (found.adjusted_inside_outside(points) - 1)
     return float(residual @ residual)

@@ -17,7 +17,6 @@ TABLE = Surroundings(plane=np.array([0.0, 0.0, 1.0, 0.0]))
 
 @pytest.fixture(scope="module")
 def picking():
-    """The world and the benchmark."""
     import picking
     from common import picking_world
 

@@ -37,12 +37,10 @@ WRONG_SHARES = {"occluded": 1.5, "noisy": -0.1, "pinhole": 2.0, "wide": -1.0}
 
 
 def log_of(folder: Path) -> list[dict[str, Any]]:
-    """The records of a run."""
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
 def endless(folder: Path, validation: int) -> list[str]:
-    """The command of a run that somebody has to stop."""
     options = f"--pixels 16 --batch 4 --points 16 --validation {validation} --threads 1 --steps 100000"
     return [sys.executable, "-m", "sq_perception", "train", "--output", str(folder), *options.split()]
 

@@ -55,7 +55,6 @@ def found(*ids: int, header: Header = HEADER) -> publication.Findings:
 
 
 def shown(bodies: dict[int, Superquadric]) -> publication.Findings:
-    """Bodies by their ids."""
     identified = Identified(recovery(*(one(body, k) for k, body in bodies.items())), tuple(bodies))
     return publication.findings(identified, HEADER, is_cube=False)
 
@@ -79,7 +78,6 @@ class Publisher:
         self._matched(SimpleNamespace(current_count_change=change))
 
     def restart(self) -> None:
-        """A listener ends and comes back, between two frames."""
         self.listeners -= 1
         self.listeners += 1
 
@@ -92,8 +90,6 @@ class Publisher:
 
 
 class Node:
-    """The part of a node that outputs and poses touch."""
-
     def __init__(self) -> None:
         self.publishers: dict[str, Publisher] = {}
         self.all: list[Publisher] = []
@@ -128,7 +124,6 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Node:
 
 @pytest.fixture
 def outputs(node: Node) -> OptionalOutputs:
-    """All of them."""
     made = OptionalOutputs(node)
     made.follow(ALL)
     return made
@@ -139,7 +134,6 @@ def beside(body: Superquadric, x: float) -> Superquadric:
 
 
 def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
-    """Operation by id of a scene."""
     return {one.id: one.operation for one in publisher.sent[which].world.collision_objects}
 
 

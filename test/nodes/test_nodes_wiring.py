@@ -48,7 +48,6 @@ def test_stamp_frame_and_numbers_arrive(bench):
 
 
 def ask_for_next(bench: Bench, service: str) -> Any:
-    """A trigger that waits for an image."""
     asked = bench.ask(Trigger, f"/recover_node/{service}")
     bench.until(lambda: bench.node._triggers)
     return asked

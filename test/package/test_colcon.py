@@ -17,7 +17,6 @@ EXECUTABLES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "
 
 
 def built(source: Path, workspace: Path, *options: str) -> Path:
-    """The install folder of a workspace with this package in src/."""
     shutil.copytree(source, workspace / "src" / PACKAGE)
     environment = {**os.environ, "COLCON_HOME": str(workspace / "home"), "COLCON_LOG_LEVEL": "30"}
     environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
@@ -34,7 +33,6 @@ def install(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def sourced(install: Path, command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    """A command in a shell that has sourced the workspace."""
     environment = {**os.environ, "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
     script = '. "$0/local_setup.sh" && exec "$@"'
     return subprocess.run(

@@ -35,7 +35,6 @@ def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def prefix(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel installed into a folder of its own."""
     folder = tmp_path_factory.mktemp("prefix")
     pip("install", "--no-deps", "--no-index", "--ignore-installed", "--no-compile", "--prefix", folder, wheel)
     return folder

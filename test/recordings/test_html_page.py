@@ -96,7 +96,6 @@ def test_a_full_disk_keeps_nothing_of_a_page(tmp_path, shot, file_size_limit, ro
 
 
 def blue(picture):
-    """Pixels in the colour of body 0: rows and columns."""
     red, green, blue = np.moveaxis(picture.astype(int), -1, 0)
     return np.nonzero((blue - red > 60) & (blue > green))
 

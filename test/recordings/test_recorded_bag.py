@@ -104,7 +104,6 @@ def recording(grey, *seconds):
 
 
 def lone(folder):
-    """The one storage file of a bag."""
     (path,) = [one for one in folder.iterdir() if one.suffix in (".mcap", ".db3")]
     return path
 

@@ -86,7 +86,6 @@ def messages(path):
 
 @pytest.fixture(scope="module")
 def scene():
-    """A frame of two bodies and what is recovered from it."""
     frame = RecordedFrame(depth_of(), CAMERA, None, "scene", encoding="32FC1")
     return frame, Recoverer(method="symmetry").recover(frame.depth, frame.camera)
 

@@ -53,7 +53,6 @@ class GivenLogits:
 
 
 def of(network: Any, depth: np.ndarray, camera: Camera = CAMERA, plane: np.ndarray = PLANE) -> SegmentNetwork:
-    """Before an image."""
     return SegmentNetwork(network, depth, camera, plane, lambda function, labels: function(labels))
 
 

@@ -31,7 +31,6 @@ STILL = tuple(standing(*place) for place in PLACES)
 
 
 def image(bodies, seed, camera=CAMERA):
-    """Things on the table with the noise of a sensor."""
     return TABLE.see(bodies, 0.001, seed, camera)[0]
 
 
@@ -63,7 +62,6 @@ def first(recoverer):
 
 
 def place_of(recovery, body):
-    """Which entry of the frame is nearest to a body."""
     return int(np.argmin([np.linalg.norm(one.superquadric.translation - body.translation) for one in recovery.bodies]))
 
 

@@ -59,7 +59,6 @@ def recoverer() -> Recoverer:
 
 
 def tilted(normal: list[float], away: float) -> np.ndarray:
-    """The plane through (0, 0, away) with this normal."""
     unit = np.array(normal, dtype=float) / np.linalg.norm(normal)
     return np.append(unit, -unit[2] * away)
 

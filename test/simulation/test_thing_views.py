@@ -25,7 +25,6 @@ NOTHING = Superquadric.stack([])
 
 
 def alone(setting: Setting, camera: Camera | None = None) -> Setting:
-    """The thing without anything around it but the wall."""
     return Setting(setting.parts, setting.cavities, NOTHING, None, 10.0, camera or setting.camera)
 
 
