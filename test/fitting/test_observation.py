@@ -54,18 +54,12 @@ def test_a_plane_before_the_object_is_refused(rng: np.random.Generator) -> None:
     surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=2 * TABLE))
 
 
-def test_a_right_mask_keeps_its_pixels_whatever_the_plane(rng: np.random.Generator) -> None:
+def test_right_pixels_stay_whatever_the_plane_and_where_most_of_a_thing_is_as_low_as_its_support(rng) -> None:
     depth, mask = image(BOX, rng)
     crop = Crop.around(depth, mask, CAMERA, None)
     assert crop is not None
     known, unknown = crop.observe(0.0025, None, TABLE), crop.observe(0.0025, None)
     np.testing.assert_array_equal(known.pixels, unknown.pixels)
-
-
-def test_a_thing_of_which_most_is_as_low_as_its_support_keeps_its_pixels(rng: np.random.Generator) -> None:
-    depth, mask = image(BOX, rng)
-    crop = Crop.around(depth, mask, CAMERA, None)
-    assert crop is not None
     above = TABLE - [0.0, 0.0, 0.0, 2 * HALF]  # a plane through its top
     assert len(crop.observe(0.0025, None, above).pixels) == len(crop.observe(0.0025, None).pixels)
 

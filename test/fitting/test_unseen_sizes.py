@@ -60,11 +60,8 @@ def test_a_bottle_that_no_superquadric_explains_is_as_deep_as_it_is_wide() -> No
     assert first == pytest.approx(second, rel=0.04)
 
 
-def test_what_is_seen_to_be_square_is_not_round() -> None:
+def test_what_is_seen_to_be_square_is_not_round_and_an_oval_stays_oval() -> None:
     assert fitted(standing([0.05, 0.05, 0.06], [0.1, 0.1], 0.6)).superquadric.shape.max() < 0.5
-
-
-def test_an_oval_that_shows_both_of_its_sides_stays_oval() -> None:
     fit = fitted(standing([0.06, 0.03, 0.04], [0.3, 1.0], 0.6))
     np.testing.assert_allclose(np.sort(fit.superquadric.size), [0.03, 0.04, 0.06], rtol=0.12)
 
@@ -144,15 +141,12 @@ def test_nothing_is_asked_where_nothing_is_open() -> None:
 # Seen and inferred
 
 
-def test_the_seen_share_of_each_size() -> None:
+def test_the_seen_share_of_each_size_counts_points_outside_as_the_face_they_lie_beyond() -> None:
     body = standing([0.05, 0.03, 0.08], [0.4, 0.6])
     local = np.random.default_rng(1).uniform(-1, 1, (4000, 3)) * body.size
     local[:, 1] = np.abs(local[:, 1])
     points = local @ body.rotation_matrix.T + body.translation
     np.testing.assert_allclose(seen_extents(body, points), [1.0, 0.5, 1.0], atol=0.03)
-
-
-def test_points_outside_count_as_the_face_they_lie_beyond() -> None:
     body = Superquadric([0.05, 0.03, 0.08], [0.4, 0.6], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
     points = np.random.default_rng(2).uniform(-1, 1, (2000, 3)) * 0.2
     np.testing.assert_allclose(seen_extents(body, points), 1.0)

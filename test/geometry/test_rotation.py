@@ -13,11 +13,8 @@ def quaternions() -> np.ndarray:
     return rotation.random(200, np.random.default_rng(1))
 
 
-def test_matrix_is_scipys(quaternions: np.ndarray) -> None:
+def test_matrices_and_products_are_scipys(quaternions: np.ndarray) -> None:
     np.testing.assert_allclose(rotation.to_matrix(quaternions), Rotation.from_quat(quaternions).as_matrix(), atol=1e-12)
-
-
-def test_product_is_scipys(quaternions: np.ndarray) -> None:
     left, right = quaternions[:100], quaternions[100:]
     expected = (Rotation.from_quat(left) * Rotation.from_quat(right)).as_matrix()
     np.testing.assert_allclose(rotation.to_matrix(rotation.multiply(left, right)), expected, atol=1e-12)

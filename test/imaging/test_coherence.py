@@ -67,15 +67,12 @@ def test_a_neighbour_that_goes_on_beyond_the_mask_goes() -> None:
 NEAR = 0.03
 
 
-def test_labels_are_beside_each_other_where_they_meet_at_about_one_depth():
+def test_labels_are_beside_each_other_at_about_one_depth_also_across_pixels_without_one():
     labels = np.array([[1, 1, 2, 2], [1, 1, 2, 2], [1, 1, 2, 2]], np.int32)
     depth = np.where(labels == 1, 1.0, np.array([[1.01], [1.1], [1.5]])).astype(np.float32)
     np.testing.assert_array_equal(np.argwhere(regions.beside(labels, depth, NEAR)), [[1, 2], [2, 1]])
     depth[0, 2:] = 1.1
     assert not regions.beside(labels, depth, NEAR).any()
-
-
-def test_labels_are_beside_each_other_across_pixels_without_a_depth():
     labels = np.array([[1, 0, 0, 2]], np.int32)
     depth = np.array([[1.0, 0.0, 0.0, 1.01]], np.float32)
     assert regions.beside(labels, depth, NEAR)[1, 2]

@@ -49,14 +49,11 @@ def test_package_xml_is_well_formed(repository: Path) -> None:
     assert all("@" in person.email for person in package.maintainers)
 
 
-def test_executables_are_where_ros2_run_looks(install: Path) -> None:
+def test_what_is_installed_is_where_ros_tools_look(install: Path) -> None:
     for name in EXECUTABLES:
         path = install / PACKAGE / "lib" / PACKAGE / name
         assert os.access(path, os.X_OK), path
         assert path.read_text(encoding="utf-8").startswith("#!/usr/bin/env python3\n"), "misses virtual environments"
-
-
-def test_share_is_complete(install: Path) -> None:
     share = install / PACKAGE / "share"
     assert (share / "ament_index/resource_index/packages" / PACKAGE).is_file()
     for name in ("package.xml", "launch/recover.launch.py", "config/fast_dds.xml", "config/superquadrics.rviz"):

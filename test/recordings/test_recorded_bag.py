@@ -297,15 +297,12 @@ def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tm
     assert masks == [[1], [2], None, [5], [4], [4]]
 
 
-def test_images_without_a_stamp_have_no_mask(tmp_path, grey):
+def test_images_without_a_stamp_have_no_mask_and_masks_that_are_ignored_are_not_read(tmp_path, grey):
+    """Ignored ones may be a coloured picture of segments on a topic of that name."""
     mask = image(np.ones_like(grey), 0, "8UC1")
     contents = [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 0, "16UC1")), ("/mask/image", 1.1, mask)]
     assert [frame.labels for frame in frames(write(tmp_path / "bag", contents))] == [None]
-
-
-def test_masks_that_are_ignored_are_not_read(tmp_path, grey):
-    """As a coloured picture of segments on a topic of that name."""
-    path = write(tmp_path / "bag", [*recording(grey, 1), ("/mask/image", 1, image(grey, 1, "rgb8"))])
+    path = write(tmp_path / "ignored", [*recording(grey, 1), ("/mask/image", 1, image(grey, 1, "rgb8"))])
     (refused,) = frames(path)
     assert "got 'rgb8'" in str(refused)
     (frame,) = frames(path, reading=Reading(ignore_masks=True))

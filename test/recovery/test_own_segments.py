@@ -175,11 +175,14 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     assert network.asked > 1
 
 
-def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
+def test_a_segment_that_is_surely_one_is_asked_about_once_and_no_segments_ask_nothing() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
     np.testing.assert_array_equal(of(network, depth).improve(segmentation(truth)).labels, truth)
     assert network.asked == 1
+    network = GivenLogits(lambda views: views)
+    assert of(network, depth).improve(segmentation(np.zeros_like(truth))).ids == ()
+    assert network.asked == 0
 
 
 def test_pieces_are_joined_until_none_belong_together() -> None:
@@ -226,15 +229,11 @@ def outliers_in_rows(share: float) -> Any:
     return GivenLogits(logits)
 
 
-def test_a_segment_that_is_mostly_outliers_keeps_its_pixels() -> None:
+def test_a_segment_that_is_mostly_outliers_keeps_its_pixels_and_one_that_shows_no_object_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(outliers_in_rows(0.55), depth).improve(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
     assert not found.outliers.any()
-
-
-def test_a_segment_that_shows_no_object_is_dropped() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(outliers_in_rows(0.8), depth).improve(segmentation(truth))
     assert found.ids == ()
     assert not found.labels.any()
@@ -275,13 +274,6 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     bodies = [table.body(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
     depth, truth = table.see(bodies, 0.002, camera=camera)
     assert len(of(shipped, depth, camera, table.plane).improve(segmentation(truth)).ids) == 5
-
-
-def test_no_segments_ask_nothing() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    network = GivenLogits(lambda views: views)
-    assert of(network, depth).improve(segmentation(np.zeros_like(truth))).ids == ()
-    assert network.asked == 0
 
 
 def test_frames_keep_the_outliers_in_their_labels_and_count_them() -> None:

@@ -207,11 +207,14 @@ def test_depths_in_millimetres_are_said(symmetry, masked):
         assert ("for millimetres" in found.message) == is_said
 
 
-def test_masks_without_an_object_say_so_and_ones_of_another_size_are_refused(symmetry):
+def test_masks_without_an_object_and_masked_labels_are_none_and_ones_of_another_size_are_refused(symmetry):
     camera, depth = Camera(64, 48, 60.0, 60.0, 32, 24), np.ones((48, 64), np.float32)
     assert symmetry.recover(depth, camera, np.zeros((48, 64), int)).message == "the masks hold no object"
     with pytest.raises(ValueError, match=r"labels: expected the shape of the depth, \(48, 64\), got \(24, 32\)"):
         symmetry.recover(depth, camera, np.zeros((24, 32), int))
+    depth, labels = seen(random_bodies(2, 3), CAMERA, background=1.4)
+    found = symmetry.recover(depth, CAMERA, np.ma.masked_array(labels, labels == 2))
+    assert [body.label for body in found.bodies] == [1]
 
 
 @pytest.mark.parametrize("most", [1, 2, 3])
@@ -265,12 +268,6 @@ def test_the_same_readings_in_another_form_give_the_same_body(symmetry, form):
     }[form]
     found, known = (symmetry.recover(image, CAMERA, labels).bodies[0].superquadric for image in images)
     np.testing.assert_array_equal(found.to_flat(), known.to_flat())
-
-
-def test_masked_labels_are_none(symmetry):
-    depth, labels = seen(random_bodies(2, 3), CAMERA, background=1.4)
-    found = symmetry.recover(depth, CAMERA, np.ma.masked_array(labels, labels == 2))
-    assert [body.label for body in found.bodies] == [1]
 
 
 @pytest.mark.parametrize("method", ["symmetry", "classic", "auto", "network"])

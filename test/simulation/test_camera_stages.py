@@ -31,14 +31,11 @@ def test_the_spatial_filter_is_a_double_exponential_of_steps_below_its_threshold
     np.testing.assert_allclose(found, w[30, 0] + (w[30, -1] - w[30, 0]) * rise, atol=1e-6)
 
 
-def test_the_spatial_filter_keeps_larger_steps_and_gaps() -> None:
+def test_the_spatial_filter_keeps_planes_larger_steps_and_gaps_and_lessens_noise() -> None:
     image = step(1.0, 1.2)
     np.testing.assert_allclose(stages.spatial(image, 0.3, 0.1, 5), image, rtol=1e-6)
     image[:, 40:43] = NAN
     np.testing.assert_array_equal(np.isnan(stages.spatial(image, 0.3, 1.0, 2)), np.isnan(image))
-
-
-def test_the_spatial_filter_keeps_planes_and_lessens_noise() -> None:
     inner = np.s_[20:-20, 20:-20]  # rows begin with their first reading
     image = plane()
     np.testing.assert_allclose(stages.spatial(image, 0.5, 0.1, 2)[inner], image[inner], rtol=1e-5)

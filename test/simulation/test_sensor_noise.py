@@ -108,13 +108,10 @@ def test_shadows_lie_on_the_side_away_from_the_projector_and_have_its_width(base
         assert (last == 119) if baseline > 0 else (first == 200)
 
 
-def test_a_thin_pole_casts_a_shadow_apart_from_itself(rng):
+def test_a_thin_pole_casts_a_shadow_apart_from_itself_and_a_tilted_plane_none(rng):
     ((first, last),) = runs(np.isnan(STILL.measure(two_walls(1.0, 2.5, 160, 166), CAMERA, rng))[100])
     assert last - first + 1 == pytest.approx(6, abs=1)
     assert 160 - first == pytest.approx(CAMERA.fx * 0.075 * (1 / 1.0 - 1 / 2.5), abs=1)
-
-
-def test_a_tilted_plane_hides_nothing_of_itself():
     for angle in (-60.0, -30.0, 0.0, 30.0, 60.0):
         assert not InverseDepth.of(wall(1.0, angle), CAMERA).hidden_from(0.075).any()
 

@@ -257,19 +257,13 @@ def drawn() -> SegmentViews:
     return draw_segment_views(10, np.random.default_rng(4))
 
 
-def test_truth_is_known_where_something_was_measured(drawn: SegmentViews) -> None:
+def test_truth_is_known_where_measured_most_of_a_segment_is_its_object_and_borders_cut_some(drawn) -> None:
+    """Cut ones have cells outside of the image beside cells of the segment."""
     assert len(drawn.images) == len(drawn.truth) > 10
     np.testing.assert_array_equal(drawn.truth == UNKNOWN, drawn.images[..., MEASURED] == 0)
-
-
-def test_most_of_a_segment_is_its_object(drawn: SegmentViews) -> None:
     inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
     assert np.median((inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))) > 0.85
     assert (drawn.truth[inside] == NO).any()
-
-
-def test_borders_cut_some(drawn: SegmentViews) -> None:
-    """Cells outside of the image beside cells of the segment."""
     outside = drawn.images[..., IMAGE] == 0
     beside = (outside[:, 1:] & (drawn.images[:, :-1, :, SEGMENT] > 0)) | (
         outside[:, :-1] & (drawn.images[:, 1:, :, SEGMENT] > 0)

@@ -30,7 +30,7 @@ from sq_perception.tracking.tracker import PREDICTED_SHARE, Tracker
 # Forms
 
 
-def test_the_first_eight_forms_are_the_equivalent_ones():
+def test_forms_are_the_equivalent_ones_and_all_are_one_body_where_the_exponents_are_equal(rng):
     truth = body()
     flats = association.candidates(truth.to_flat())[: association.EXACT]
     for other in truth.equivalent_forms():
@@ -39,9 +39,6 @@ def test_the_first_eight_forms_are_the_equivalent_ones():
             for flat in flats
         ]
         assert sum(same) == 1
-
-
-def test_all_forms_are_one_body_where_the_exponents_are_equal(rng):
     truth = body(shape=(0.4, 0.4))
     points = truth.translation + rng.uniform(-0.06, 0.06, (200, 3))
     for flat in association.candidates(truth.to_flat()):

@@ -77,12 +77,21 @@ def test_ids_survive_an_occlusion_but_not_an_absence(rng):
     assert [t.id for t in tracks] == [1, 3]
 
 
-def test_what_is_there_but_was_not_recovered_does_not_die(rng):
+def test_what_is_hidden_or_not_recovered_does_not_die_but_lives_not_for_ever(rng):
     truth, tracker = body(), Tracker()
     depth = image_of(truth)
     for k in range(20):
         tracks = tracker.update([draw(truth, noise(), rng)] if k < 4 else [], k / 30, camera=CAMERA, depth=depth)
     assert [t.state for t in tracks] == [TrackState.LOST]
+    tracker = Tracker()
+    tracker.update([draw(body(), noise(), rng)], 0.0)
+    assert len(tracker.update([], FORGET_AFTER - 0.1, camera=CAMERA, depth=NOTHING)) == 1
+    assert tracker.update([], FORGET_AFTER + 0.1, camera=CAMERA, depth=NOTHING) == ()
+    tracker, masked = Tracker(), np.ma.masked_array(np.full((CAMERA.height, CAMERA.width), 9.0), True)
+    tracker.update([draw(body(), noise(), rng)], 0.0)
+    for k in range(1, 60):
+        tracks = tracker.update([], FORGET_AFTER * k / 100, camera=CAMERA, depth=masked)
+    assert len(tracks) == 1
 
 
 STRAIGHT = {"turn": (0, 0, 0)}
@@ -108,13 +117,6 @@ def test_what_is_recovered_no_more_lives_as_long_as_the_image_shows_it(rng, stay
         seen = [draw(each, noise(), rng) for each in ([stays, other] if k < 4 else [stays])]
         tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
     assert [t.id for t in tracks] == ([1, 2] if lives else [1])
-
-
-def test_nothing_hidden_lives_for_ever(rng):
-    tracker = Tracker()
-    tracker.update([draw(body(), noise(), rng)], 0.0)
-    assert len(tracker.update([], FORGET_AFTER - 0.1, camera=CAMERA, depth=NOTHING)) == 1
-    assert tracker.update([], FORGET_AFTER + 0.1, camera=CAMERA, depth=NOTHING) == ()
 
 
 def test_a_new_body_is_tentative_first(rng):
@@ -261,14 +263,6 @@ def test_what_is_gone_is_seen_to_have_gone_by_an_image_of_single_readings(nothin
     np.testing.assert_array_equal(visibility.open_share(bodies, CAMERA, depth), [1, 1, 0])
 
 
-def test_masked_readings_are_no_empty_space(rng):
-    tracker, masked = Tracker(), np.ma.masked_array(np.full((CAMERA.height, CAMERA.width), 9.0), True)
-    tracker.update([draw(body(), noise(), rng)], 0.0)
-    for k in range(1, 60):
-        tracks = tracker.update([], FORGET_AFTER * k / 100, camera=CAMERA, depth=masked)
-    assert len(tracks) == 1
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -358,12 +352,9 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
     assert len(named) > 2
 
 
-def test_the_limits_of_chi_squared_are_scipys():
+def test_limits_of_chi_squared_and_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
     for freedom, limit in association.LIMITS.items():
         assert limit == pytest.approx(chi2.ppf(0.999, freedom), rel=1e-12)
-
-
-def test_the_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
     for _ in range(300):
         cost = rng.normal(size=np.sort(rng.integers(1, 9, 2)))
         cost[rng.random(cost.shape) < 0.5] = 2.0
