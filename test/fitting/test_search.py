@@ -34,7 +34,7 @@ def test_a_resized_body_keeps_the_face_that_the_camera_sees(state: State, axis: 
     np.testing.assert_array_equal(np.delete(other.parameters[:5], axis), np.delete(state.parameters[:5], axis))
 
 
-def test_other_orders_are_the_same_box(state: State) -> None:
+def test_other_orders_are_the_same_box_and_a_turned_body_keeps_its_axis_and_moments(state: State) -> None:
     corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=float)
 
     def box(one: State) -> set[tuple[float, ...]]:
@@ -47,9 +47,6 @@ def test_other_orders_are_the_same_box(state: State) -> None:
         assert np.linalg.det(other.rotation) == pytest.approx(1)
         assert box(other) == box(state)
         assert abs(other.rotation[:, 2] @ state.rotation[:, 2]) < 1e-9
-
-
-def test_a_turned_body_keeps_its_axis_and_the_moments_of_its_section(state: State) -> None:
     other = turned(state)
     assert np.linalg.det(other.rotation) == pytest.approx(1)
     np.testing.assert_allclose(other.rotation[:, 2], state.rotation[:, 2], atol=1e-12)

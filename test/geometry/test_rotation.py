@@ -29,7 +29,7 @@ def test_matrix_round_trip_for_every_largest_component(quaternions: np.ndarray) 
         )
 
 
-def test_rotation_vectors_come_back_also_near_zero_and_from_either_sign() -> None:
+def test_rotation_vectors_are_scipys_and_come_back_also_near_zero_and_from_either_sign() -> None:
     rng = np.random.default_rng(3)
     for scale in (0, 1e-9, 1e-5, 1.0, 3.1):
         direction = rng.standard_normal((50, 3))
@@ -39,9 +39,6 @@ def test_rotation_vectors_come_back_also_near_zero_and_from_either_sign() -> Non
             np.testing.assert_allclose(rotation.to_rotation_vector(same), vector, rtol=1e-9, atol=1e-15)
     long = rotation.from_rotation_vector(np.array([0, 0, 4.0]))
     np.testing.assert_allclose(rotation.to_rotation_vector(long), [0, 0, 4.0 - 2 * np.pi])
-
-
-def test_rotation_vector_is_scipys_also_near_zero() -> None:
     rng = np.random.default_rng(2)
     for scale in (0, 1e-9, 1e-5, 1.0, 3.0):
         vectors = rng.standard_normal((50, 3)) * scale

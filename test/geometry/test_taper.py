@@ -153,15 +153,12 @@ def test_the_support_is_the_largest_of_all_sections() -> None:
             np.testing.assert_allclose(compiled, reach.max(axis=1), rtol=1e-5)
 
 
-def test_all_forms_are_the_same_body() -> None:
+def test_all_forms_are_the_same_body_and_the_untapered_one_encloses_it() -> None:
     rng = np.random.default_rng(6)
     body = tapered(rng)
     points = body.sample_surface(200, rng)
     for form in [*body.equivalent_forms(), body.canonical_form(), Superquadric.stack([body]).canonical_form()[0]]:
         np.testing.assert_allclose(form.gauge(points), 1.0, atol=1e-9)
-
-
-def test_the_untapered_body_encloses_it() -> None:
     rng = np.random.default_rng(7)
     body = tapered(rng)
     around = body.untapered()

@@ -35,12 +35,9 @@ def world_of(picking):
     return made
 
 
-def test_a_thing_rests_where_it_was_put(world_of):
+def test_a_thing_rests_where_it_was_put_a_good_grasp_holds_and_the_same_beside_does_not(world_of):
     position, _ = world_of().pose(0)
     np.testing.assert_allclose(position, [0, 0, HALF[2]], atol=1e-3)
-
-
-def test_a_good_grasp_holds_and_the_same_beside_does_not(world_of):
     at = np.array([0.0, 0.0, 0.075])
     assert world_of().pick(at, DOWN, 0.075).how == "held"
     assert world_of().pick(at + [0.03, 0.0, 0.0], DOWN, 0.075).how == "missed"

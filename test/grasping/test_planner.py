@@ -109,16 +109,13 @@ def test_the_gripper_stands_off_the_body_and_the_table():
                 assert grasp.to_body_frame(box[:3] + corners * box[3:])[:, 2].min() > 0.0
 
 
-def test_what_is_wider_than_the_opening_is_never_tried():
+def test_what_is_wider_than_the_opening_or_behind_the_support_has_that_for_a_reason():
+    """Also where it is too wide; what looks out of the plane only in part is in the table's way."""
     found = plan(standing([0.041] * 3, [0.1, 0.1]), standing(*SPHERE, x=0.3))
     assert not found.of(0)
     assert "wider than the opening of 80 mm" in found.reasons[0]
     assert found.of(1)
     assert found.reasons[1] == ""
-
-
-def test_what_lies_behind_the_support_has_that_for_a_reason():
-    """Also where it is too wide; what looks out of the plane only in part is in the table's way."""
     sunk = Superquadric(*CAN, [0.5, 0.0, -0.055], UPRIGHT)
     behind = Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT)
     wide = Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT)

@@ -39,7 +39,7 @@ def shards(folder: Path, count: int, rng: np.random.Generator) -> None:
         save_file(arrays, str(folder / f"{k:05d}.safetensors"))
 
 
-def test_directions_are_42_and_closed_under_mirrors() -> None:
+def test_directions_are_42_and_closed_under_mirrors_and_planes_mirror_with_their_points(rng) -> None:
     assert DIRECTIONS.shape == (42, 3)
     assert np.linalg.norm(DIRECTIONS, axis=1) == pytest.approx(np.ones(42))
     for axis in range(3):
@@ -47,6 +47,10 @@ def test_directions_are_42_and_closed_under_mirrors() -> None:
         assert DIRECTIONS[mirrored(axis)] == pytest.approx(turned)
     # No two of them are nearer than the edge of a twice divided icosahedron allows.
     assert np.max(DIRECTIONS @ DIRECTIONS.T - 2 * np.eye(42)) == pytest.approx(0.8506508, abs=1e-6)
+    plane, points = rng.standard_normal(4), rng.random((10, 3))
+    there = mirror_planes(plane[None])[0]
+    moved = points * [-1, 1, 1] + [1, 0, 0]
+    assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
 
 
 def test_the_likelihood_is_that_of_a_multivariate_t(rng: np.random.Generator) -> None:
@@ -90,13 +94,6 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
     assert turned.support[:, back] == pytest.approx(straight.support, abs=1e-5)
     assert turned.covariance[:, back][:, :, back] == pytest.approx(straight.covariance, abs=1e-5)
     assert (np.linalg.eigvalsh(straight.covariance) > 0).all()
-
-
-def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
-    plane, points = rng.standard_normal(4), rng.random((10, 3))
-    there = mirror_planes(plane[None])[0]
-    moved = points * [-1, 1, 1] + [1, 0, 0]
-    assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
 
 
 def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> None:

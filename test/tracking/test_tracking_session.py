@@ -116,8 +116,9 @@ def test_what_spans_more_than_its_track_is_published_as_it_is_seen(rng):
     np.testing.assert_allclose(np.sort(found.sigma_size), np.sort(0.3 * bowl.size))
 
 
-def test_an_old_answer_counts_where_the_camera_was_corrected(rng):
-    """Still frames repeat an answer; then the map moves the camera by 4 cm: no body stays where the old pose had it."""
+def test_an_old_answer_counts_where_the_camera_was_corrected_and_after_a_pause(rng):
+    """Still frames repeat an answer; then the map moves the camera by 4 cm: no body stays where the old pose had it. As
+    when an arm was at work for some seconds: the pose was forgotten, and the image shows where the body is."""
     one, truth = TrackingSession(), body()
     seen = draw(truth, noise(), rng)
     for k in range(14):
@@ -126,10 +127,6 @@ def test_an_old_answer_counts_where_the_camera_was_corrected(rng):
         off = found.superquadric.translation - seen.superquadric.translation
         assert np.linalg.norm(off) < 0.004, f"frame {k}"
     assert found.id == 1
-
-
-def test_an_old_answer_counts_after_a_pause(rng):
-    """As when an arm was at work for some seconds: the pose was forgotten, and the image shows where the body is."""
     one, seen = TrackingSession(), draw(body(), noise(), rng)
     before, _, after = (one.follow([seen._replace(repeats=k)], stamp)[0] for k, stamp in enumerate((0.0, 0.2, 8.0)))
     known = [np.sqrt(np.diag(each.covariance)) for each in (before, after)]
