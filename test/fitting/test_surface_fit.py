@@ -336,6 +336,15 @@ def test_a_narrow_mask_is_no_line(width: int) -> None:
     assert surface_fit.fit(depth, mask, camera).status != Status.FAILED
 
 
+def test_an_inverse_of_information_is_a_covariance(rng: np.random.Generator) -> None:
+    """One direction known 10^10 times as well as another that is known from the prior alone."""
+    axes, _ = np.linalg.qr(rng.normal(size=(11, 11)))
+    found = quality._inverse((axes * np.r_[1e20, 1e12, np.full(9, 1.0)]) @ axes.T, 1.0)
+    deviations = np.linalg.eigvalsh((found + found.T) / 2)
+    assert deviations.min() > -1e-12
+    assert deviations.max() <= 1 + 1e-9
+
+
 def test_misuse_raises() -> None:
     mask, body = square_mask(30, 40), Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
     for depth, pixels, words in (

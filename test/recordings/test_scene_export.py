@@ -25,7 +25,7 @@ def bodies(seed: int = 4) -> Superquadric:
     size = np.array([[0.05, 0.02, 0.08], [0.03, 0.03, 0.06], [0.04] * 3, [0.02, 0.02, 0.09], [0.03, 0.05, 0.04]])
     shape = np.array([[0.1, 0.1], [0.1, 1.0], [1.0, 1.0], [1.0, 1.0], [0.6, 1.6]])
     turns, pitches = rotation.random(5, rng), np.array([1.0, -1.0])[:, None] * [0.0, np.pi / 2, 0.0]
-    turns[:2] = rotation.multiply(rotation.from_rotation_vector(pitches), turns[:2] * [0, 0, 1, 1])
+    turns[:2] = rotation.multiply(turns[:2] * [0, 0, 1, 1], rotation.from_rotation_vector(pitches))
     return Superquadric(size, shape, rng.uniform(-1, 1, (5, 3)), turns)
 
 
