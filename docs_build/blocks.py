@@ -170,7 +170,7 @@ def package_layers() -> tuple[tuple[str, ...], ...]:
 
 
 def packages() -> str:
-    """The subpackages with their layer in brackets and, from their docstring, their purpose; the highest layer first."""
+    """The subpackages, layers in brackets, with their purpose from their docstring; the highest layer first."""
     layers = package_layers()
     rows = (
         f"- [`{name}/`](../sq_perception/{name}/__init__.py) ({number}): {purpose(name)}"

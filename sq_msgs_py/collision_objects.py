@@ -178,10 +178,8 @@ def collision_objects(
 
 
 def removals(names: Iterable[str], header: Any) -> list[CollisionObject]:
-    """Return one object to REMOVE for each name.
-
-    Raises ImportError without moveit_msgs; ValueError for an empty name: MoveIt would remove every object of the scene.
-    """
+    """Return one object to REMOVE for each name.  Raises ImportError without moveit_msgs; ValueError for an empty name:
+    MoveIt would remove every object of the scene."""
     from moveit_msgs.msg import CollisionObject
 
     names = sorted(names)

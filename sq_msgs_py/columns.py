@@ -104,9 +104,7 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = find_type) -> P
 
 def from_message(kind: type[Rows], message: PointCloud2) -> Rows:
     """Return the rows of a message; columns that have a default are left out where their fields are not all there.
-
-    Raises MessageError as :func:`cloud_points`, or for columns that ``kind`` does not take.
-    """
+    Raises MessageError as :func:`cloud_points`, or for columns that ``kind`` does not take."""
     needed = {name for each in fields(kind) if each.default is MISSING for name in each.metadata["names"]}
     known = [name for name, _ in kind.FIELDS]
     points = cloud_points(message, known, [name for name in known if name in needed])

@@ -66,10 +66,8 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
 
 
 def mark_negatives(arguments: Sequence[str]) -> list[str]:
-    """Prepare arguments with negative numbers, so that argparse takes none of them for an option.
-
-    It does so with -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores.
-    """
+    """Prepare arguments with negative numbers, so that argparse takes none of them for an option.  It does so with
+    -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores."""
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 

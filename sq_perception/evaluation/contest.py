@@ -80,11 +80,8 @@ class ThesisImages:
 
 
 class Answers(NamedTuple):
-    """What a contestant recovered from n images.
-
-    ``bodies`` (n, 12) are flat in the cube frame, NaN where nothing was recovered; ``milliseconds`` (n,) the time of
-    each image, NaN where it was not measured.
-    """
+    """What a contestant recovered from n images.  ``bodies`` (n, 12) are flat in the cube frame, NaN where nothing was
+    recovered; ``milliseconds`` (n,) the time of each image, NaN where it was not measured."""
 
     bodies: np.ndarray
     milliseconds: np.ndarray
@@ -113,11 +110,8 @@ class Contestant:
 
 
 def network(path: Path, name: str | None = None) -> Contestant:
-    """The network of a weights file.
-
-    Raises CheckpointError if the file is missing, damaged or of another kind, or its header names a loss that is not
-    known.
-    """
+    """The network of a weights file.  Raises CheckpointError if the file is missing, damaged or of another kind, or its
+    header names a loss that is not known."""
     model = inference.load(path)
     header = checkpoint.read_header(path)
     try:

@@ -43,10 +43,8 @@ GOOD_IOU = 0.85
 
 @dataclass(frozen=True, eq=False)
 class FiguresOfMerit:
-    """Figures of n bodies, arrays (n,), ``delta_t`` (n, 3); fractions and radians, see the module.
-
-    ``milliseconds`` is the execution time of each image by itself, NaN where it was not measured.
-    """
+    """Figures of n bodies, arrays (n,), ``delta_t`` (n, 3); fractions and radians, see the module.  ``milliseconds`` is
+    the execution time of each image by itself, NaN where it was not measured."""
 
     iou: np.ndarray
     volume_iou: np.ndarray

@@ -49,9 +49,7 @@ def draw_depth(
     ax: Axes, depth: np.ndarray, limits: tuple[float, float] | None = None, window: Window | None = None
 ) -> None:
     """A depth image (height, width), or its ``window``: near is light, far is dark, nothing measured is black.
-
-    ``limits`` are the nearest and farthest depth of the scale; the middle 96 % of the image by default.
-    """
+    ``limits`` are the nearest and farthest depth of the scale; the middle 96 % of the image by default."""
     finite = np.where(np.isfinite(depth), depth, np.nan)
     if limits is None:
         seen = finite[np.isfinite(finite)]

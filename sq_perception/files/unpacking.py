@@ -60,9 +60,7 @@ def _check_count(array: np.ndarray, where: str = "") -> np.ndarray:
 
 def grey_image(path: Path, of_indices: bool = False) -> np.ndarray:
     """Read a grey PNG, BMP or TIFF (height, width), of any type of number; three equal channels are grey too.
-
-    ``of_indices`` takes a palette's indices in place of its colours: so label images are stored.
-    """
+    ``of_indices`` takes a palette's indices in place of its colours: so label images are stored."""
     from PIL import Image
 
     try:

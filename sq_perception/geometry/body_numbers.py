@@ -24,9 +24,7 @@ def floating(part: Any) -> np.ndarray:
 
 def one_body(parts: list[Any]) -> np.ndarray | None:
     """Check size, shape, translation, rotation, which becomes a unit quaternion, and taper of one NumPy body: (14,).
-
-    So few numbers are checked ten times as fast in Python.  None for anything else, numbers of no body included.
-    """
+    So few numbers are checked ten times as fast in Python.  None for anything else, numbers of no body included."""
     for part in parts:
         if not (type(part) is np.ndarray and part.ndim == 1 and part.dtype == np.float64):
             return None
@@ -47,10 +45,8 @@ def one_body(parts: list[Any]) -> np.ndarray | None:
 
 
 def check_turn(parts: list[np.ndarray]) -> np.ndarray:
-    """Check size, shape, translation, rotation and taper; return unit quaternions (..., 4).
-
-    Raises ValueError unless these are the numbers of bodies.
-    """
+    """Check size, shape, translation, rotation and taper; return unit quaternions (..., 4).  Raises ValueError unless
+    these are the numbers of bodies."""
     for name, part in zip(LENGTHS, parts, strict=True):
         if not np.isfinite(part).all():
             raise ValueError(f"{name}: expected finite numbers, got {part}")

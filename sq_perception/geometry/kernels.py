@@ -217,10 +217,8 @@ def _by_sine(s: float, nx: float, ny: float, nz: float, form: Form) -> tuple[flo
 
 @kernel
 def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
-    """The sines (n,) of :func:`_by_sine` at the maximum for directions (3, n) in the frame of a tapered body.
-
-    The best of a few, then secants that never leave a bracket; loops over directions without a branch, for vector code.
-    """
+    """The sines (n,) of :func:`_by_sine` at the maximum for directions (3, n) in the frame of a tapered body.  The best
+    of a few, then secants that never leave a bracket; loops over directions without a branch, for vector code."""
     count = directions.shape[1]
     s, low, high, best = np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, -np.inf)
     before, excess_before = np.zeros(count), np.zeros(count)

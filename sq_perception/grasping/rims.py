@@ -70,10 +70,8 @@ def rim_grasps(
 def _rims(
     body: Superquadric, owner: int, gripper: Gripper, around: Surroundings
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim.
-
-    A rim is 6 mm high, up to 12 mm thick and up to 15 mm outside of the body.
-    """
+    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim.  A rim is 6
+    mm high, up to 12 mm thick and up to 15 mm outside of the body."""
     assert around.plane is not None
     upwards = around.plane[:3] @ body.rotation_matrix
     axis = int(np.argmax(np.abs(upwards)))

@@ -26,10 +26,8 @@ MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "othe
 
 
 class Trials(NamedTuple):
-    """k candidate grasps and the logarithm of the probability of each margin so far.
-
-    ``sides`` (k, 2) are those of the two sides that the fingers pass, whose sum is the margin of the opening.
-    """
+    """k candidate grasps and the logarithm of the probability of each margin so far.  ``sides`` (k, 2) are those of the
+    two sides that the fingers pass, whose sum is the margin of the opening."""
 
     owner: np.ndarray
     frames: np.ndarray

@@ -95,10 +95,8 @@ class Calibration:
         return sent.width, sent.height
 
     def rectify(self, depth: np.ndarray) -> np.ndarray:
-        """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.
-
-        Raises ValueError if the image has not the size of ``size``; the message names the likely reason.
-        """
+        """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.  Raises
+        ValueError if the image has not the size of ``size``; the message names the likely reason."""
         self.check(depth)
         return depth if self.rectification is None else self.rectification.there.depth(depth)
 
@@ -109,9 +107,7 @@ class Calibration:
 
     def as_sent(self, depth: np.ndarray) -> np.ndarray:
         """A depth image of ``camera`` with the pixels of the images as they are sent; metres, NaN or inf for nothing.
-
-        Raises ValueError if the image has not the size of ``camera``.
-        """
+        Raises ValueError if the image has not the size of ``camera``."""
         self.camera.check_image(depth)
         return depth if self.rectification is None else self.rectification.back.depth(depth)
 

@@ -247,9 +247,7 @@ def _rotate(
     depth: np.ndarray, mask: np.ndarray, unread: float, lens: Lens, matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere; least, largest turned (x, y); least z.
-
-    Unless ``unread`` is NaN, the (x, y) of other pixels of the mask, as deep as that, are among those.
-    """
+    Unless ``unread`` is NaN, the (x, y) of other pixels of the mask, as deep as that, are among those."""
     image = np.full(depth.shape, np.float32(np.nan))
     low, high, closest = np.full(2, np.inf), np.full(2, -np.inf), np.inf
     for v in range(depth.shape[0]):

@@ -90,9 +90,7 @@ def shown_step(footprint: float) -> float:
 @kernel
 def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
     """The mask (height, width) without the pieces that are of something else; a step is more than ``jump`` metres.
-
-    Pixels without depth, NaN, belong to no piece and stay.
-    """
+    Pixels without depth, NaN, belong to no piece and stay."""
     # Share of a piece's pixels, or of the border pixels of one across a step, that lie beside pixels of its depth
     # outside the mask, from which on it is a fringe.
     fringe = 1 / 3

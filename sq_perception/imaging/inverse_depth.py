@@ -37,10 +37,8 @@ class InverseDepth:
 
     @classmethod
     def of(cls, depth: np.ndarray, camera: Camera) -> InverseDepth:
-        """The inverse of a depth image (height, width), metres, positive; +inf or NaN where nothing is seen.
-
-        Raises ValueError if the camera is no pinhole, or a depth is not positive.
-        """
+        """The inverse of a depth image (height, width), metres, positive; +inf or NaN where nothing is seen.  Raises
+        ValueError if the camera is no pinhole, or a depth is not positive."""
         if not camera.is_pinhole:
             raise ValueError(f"camera: expected a pinhole camera, got an {camera.projection} one")
         with np.errstate(divide="ignore"):

@@ -115,9 +115,7 @@ class Lookup:
 
     def depth(self, image: np.ndarray) -> np.ndarray:
         """The depth image, float32 in metres, from one of the source: positive, NaN or +inf where there is nothing.
-
-        The result is NaN where there is no depth, also where the source does not see.
-        """
+        The result is NaN where there is no depth, also where the source does not see."""
         image = np.ascontiguousarray(image, dtype=np.float32)
         nearest = self._nearest(image, np.nan)
         # Warnings for pixels without depth only.

@@ -145,11 +145,8 @@ def _show(
     image: np.ndarray, depth: np.ndarray, labels: np.ndarray, label: int, rows: np.ndarray, columns: np.ndarray,
     lens: Lens, plane: np.ndarray, middle: float, scale: float,
 ) -> None:
-    """Write what the cells of an empty view show.
-
-    ``rows`` and ``columns`` (POINTS PIXELS,) are the pixels under the points of the cells, ``middle`` and ``scale`` the
-    module's m and s; a ``plane`` that is not known is 0.
-    """
+    """Write what the cells of an empty view show.  ``rows`` and ``columns`` (POINTS PIXELS,) are the pixels under the
+    points of the cells, ``middle`` and ``scale`` the module's m and s; a ``plane`` that is not known is 0."""
     fx, fy, cx, cy, _ = lens
     height, width = depth.shape
     least, most = -0.3, 1.5

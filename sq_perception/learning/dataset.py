@@ -105,10 +105,8 @@ def wide_bodies(count: int, rng: np.random.Generator) -> Superquadric:
 def draw_views(
     count: int, rng: np.random.Generator, source: ViewSource | None = None, occluder: Occluder | None = None
 ) -> tuple[np.ndarray, Superquadric]:
-    """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.
-
-    Noise, holes and edges are left to :meth:`Disturbance.apply`, which changes a view anew each time it is used.
-    """
+    """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.  Noise, holes and
+    edges are left to :meth:`Disturbance.apply`, which changes a view anew each time it is used."""
     source = source or ViewSource()
     pinhole_share, disturbance = source.pinhole_share, source.disturbance
     bodies = thesis_bodies(count, rng)

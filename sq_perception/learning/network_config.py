@@ -31,11 +31,8 @@ LEAST_LOG, MOST_LOG = -5.0, 0.5
 
 @dataclass(frozen=True)
 class RegressorConfig:
-    """Everything that fixes the network's form; travels in the checkpoint's header.
-
-    Raises ValueError for an unknown backbone or framing, a side that the backbone cannot halve often enough, or an
-    empty range.
-    """
+    """Everything that fixes the network's form; travels in the checkpoint's header.  Raises ValueError for an unknown
+    backbone or framing, a side that the backbone cannot halve often enough, or an empty range."""
 
     pixels: int = 64  # side of the views: a multiple of 32 for resnet18, of 2 to the number of widths for compact
     widths: tuple[int, ...] = (32, 64, 128, 256)
@@ -86,10 +83,8 @@ class RegressorConfig:
 
     @classmethod
     def thesis(cls) -> RegressorConfig:
-        """The thesis' network for the thesis' images: ResNet-18, 256 x 256, the whole cube.
-
-        Its bodies have half sizes of 0.098 to 0.294 and centres of 0.35 to 0.66; the ranges leave room beside them.
-        """
+        """The thesis' network for the thesis' images: ResNet-18, 256 x 256, the whole cube.  Its bodies have half sizes
+        of 0.098 to 0.294 and centres of 0.35 to 0.66; the ranges leave room beside them."""
         return cls(
             pixels=256, size_range=(0.05, 0.4), translation_range=(0.0, 1.0), backbone="resnet18", framing="full"
         )

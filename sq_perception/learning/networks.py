@@ -196,10 +196,8 @@ class Regressor(nn.Module):
             return torch.cat([self.get_submodule(name)(h) for name in heads(self.config)], dim=-1)
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        """NumPy superquadrics (n,) of NumPy views (n, p, p).
-
-        Raises ValueError if the views are not (n, p, p) with p = ``config.pixels``, or not finite.
-        """
+        """NumPy superquadrics (n,) of NumPy views (n, p, p).  Raises ValueError if the views are not (n, p, p) with p =
+        ``config.pixels``, or not finite."""
         batch = torch.from_numpy(check_views(views, self.config))[:, None]
         self.eval()
         device = next(self.parameters()).device
@@ -294,9 +292,7 @@ class ThingNetwork(nn.Module):
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
         """The predictions for NumPy views (b, p, p), planes (b, 4) and extents (b,), in float32, in evaluation mode.
-
-        Bodies (b,), support functions (b, J) and their S (b, J, J), in the views' frames; NumPy.
-        """
+        Bodies (b,), support functions (b, J) and their S (b, J, J), in the views' frames; NumPy."""
         self.eval()
         device = next(self.parameters()).device
         with torch.inference_mode():

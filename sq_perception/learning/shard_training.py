@@ -205,10 +205,8 @@ def validate_things(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
 
 
 def calibrate_spread(network: ThingNetwork, views: ThingViews) -> None:
-    """Scale S so that error / sigma deviates by 1 on these views; 4000 views settle it to 2 %.
-
-    The likelihood leaves 1.3, as it takes errors in longer tails than those of the t distribution for rare.
-    """
+    """Scale S so that error / sigma deviates by 1 on these views; 4000 views settle it to 2 %.  The likelihood leaves
+    1.3, as it takes errors in longer tails than those of the t distribution for rare."""
     spread = network.config.spread * validate_things(network, views)["ratio"] ** 2
     network.config = replace(network.config, spread=float(spread))
 

@@ -122,10 +122,8 @@ def validate(
 
 
 def recalibrate(model: Regressor, views: torch.Tensor, batch: int) -> None:
-    """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).
-
-    An average of weights has activations of its own: those recorded while the moving weights trained do not fit it.
-    """
+    """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).  An average of weights has
+    activations of its own: those recorded while the moving weights trained do not fit it."""
     device = next(model.parameters()).device
     whole = views[: len(views) // batch * batch].split(batch)
     update_bn((part.to(device, memory_format=torch.channels_last) for part in whole), model)

@@ -58,10 +58,8 @@ class Task:
 
 @dataclass(eq=False)
 class TrainingState:
-    """What a training holds between two steps; goes on from the file where there is one.
-
-    Raises CheckpointError if the file is damaged, or of a run with another network.
-    """
+    """What a training holds between two steps; goes on from the file where there is one.  Raises CheckpointError if the
+    file is damaged, or of a run with another network."""
 
     path: Path
     model: Any
@@ -82,10 +80,8 @@ class TrainingState:
 
     @classmethod
     def begin(cls, model: Any, config: Run, output: Path, form: tuple[str, ...] = ()) -> TrainingState:
-        """The state of a new run of a network, or of the one that ``output`` holds.
-
-        Raises CheckpointError also where that one differs in a setting of ``form``.
-        """
+        """The state of a new run of a network, or of the one that ``output`` holds.  Raises CheckpointError also where
+        that one differs in a setting of ``form``."""
         path, device = output / "state.safetensors", next(model.parameters()).device
         before = read_settings(path)
         other = [name for name in form if before.get(name, getattr(config, name)) != getattr(config, name)]
@@ -265,10 +261,8 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """So many threads for a network and for the rendering of its views; 0 leaves both their own choice.
-
-    Each has a pool of its own, whose threads wait by spinning: beside other work a second one makes both much slower.
-    """
+    """So many threads for a network and for the rendering of its views; 0 leaves both their own choice.  Each has a
+    pool of its own, whose threads wait by spinning: beside other work a second one makes both much slower."""
     before = torch.get_num_threads(), numba.get_num_threads()
     if count:
         torch.set_num_threads(count)

@@ -111,10 +111,8 @@ class Run(ABC):
 
 @dataclass(frozen=True)
 class TrainingConfig(Run):
-    """A run of the regressor.  The defaults are those of the compact network under L_OC.
-
-    Raises ValueError for an unknown name, a number out of its range, or settings that contradict each other.
-    """
+    """A run of the regressor.  The defaults are those of the compact network under L_OC.  Raises ValueError for an
+    unknown name, a number out of its range, or settings that contradict each other."""
 
     loss: str = _setting("occupancy", "What is minimised; the equations are in sq_perception/learning/losses.py.")
     backbone: str = _setting("compact", "compact, or resnet18 as in the thesis.")
@@ -208,10 +206,8 @@ MASK_RUN = ShardTraining(minutes=60.0, learning_rate=3e-3, weight_decay=1e-3)
 
 
 def read(path: str | Path, **changes: Any) -> TrainingConfig:
-    """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.
-
-    Raises ValueError if there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
-    """
+    """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.  Raises
+    ValueError if there is no such file, or it holds anything but fields of :class:`TrainingConfig`."""
     return TrainingConfig(**{**_values(path), **changes})
 
 

@@ -166,11 +166,8 @@ def draw_masks(message: MaskMessage, size: tuple[int, int]) -> np.ndarray:
 
 
 def image_topic(node: Node, transport: str) -> str:
-    """Return the topic of depth images, with the node's namespace and remappings.
-
-    The transport is appended to the remapped ``depth/image``, unless that ends in it.  Points have a separate topic,
-    ``depth/points``.
-    """
+    """Return the topic of depth images, with the node's namespace and remappings.  The transport is appended to the
+    remapped ``depth/image``, unless that ends in it.  Points have a separate topic, ``depth/points``."""
     if transport == POINTS:
         return str(node.resolve_topic_name("depth/points"))
     resolved: str = node.resolve_topic_name("depth/image")

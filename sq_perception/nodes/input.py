@@ -59,10 +59,8 @@ class _Info:
 
 
 class Input:
-    """The subscriptions of an active node and their messages.
-
-    An image that comes while none ``is_wanted`` is dropped at once.
-    """
+    """The subscriptions of an active node and their messages.  An image that comes while none ``is_wanted`` is dropped
+    at once."""
 
     def __init__(
         self, node: Node, settings: LiveParameters[RecoverParameters], is_wanted: Callable[[], bool],
@@ -158,10 +156,8 @@ class Input:
             return arrival
 
     def frame(self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None) -> Frame:
-        """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.
-
-        Raises ValueError for anything that keeps it from being processed.
-        """
+        """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.  Raises
+        ValueError for anything that keeps it from being processed."""
         message, use, source = arrival.message, parameters.use_masks, self._info
         frame = frames.decode(
             message, None if source is None else lambda: self._calibration_of(message, source),

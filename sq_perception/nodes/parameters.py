@@ -46,10 +46,8 @@ def setting(
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.
-
-    Raises ParameterError for a value that is none of the choices, or does not fit the others.
-    """
+    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.  Raises
+    ParameterError for a value that is none of the choices, or does not fit the others."""
 
     def __post_init__(self) -> None:
         for parameter in fields(self):

@@ -136,11 +136,8 @@ def additions() -> dict[str, str]:
 
 
 def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
-    """Create a node of this class.
-
-    If that fails, the unfinished node is destroyed before the error is raised: its shared memory would outlive this
-    process, and a launch file tries again and again.
-    """
+    """Create a node of this class.  If that fails, the unfinished node is destroyed before the error is raised: its
+    shared memory would outlive this process, and a launch file tries again and again."""
     node = kind.__new__(kind)
     try:
         node.__init__(*arguments, **named)  # type: ignore[misc]  # of the class itself
@@ -152,10 +149,8 @@ def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
 
 
 def share_heaps() -> None:
-    """Let threads allocate from the same heaps; heaps of their own keep what a frame has freed, 25 MB in all.
-
-    Changes nothing without glibc.  For the start of a process: heaps that are there already stay.
-    """
+    """Let threads allocate from the same heaps; heaps of their own keep what a frame has freed, 25 MB in all.  Changes
+    nothing without glibc.  For the start of a process: heaps that are there already stay."""
     with suppress(AttributeError):
         ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of malloc.h; with one heap threads wait for each other
 

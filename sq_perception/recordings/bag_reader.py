@@ -53,9 +53,7 @@ def camera_info_topic(topic: str) -> str:
 
 def info_topic(reader: BagReader, topic: str, image: Message | None, wanted: str | None) -> InfoTopic:
     """Return the camera_info topic for the images of a topic, of which one is given, or the one that was asked for.
-
-    Raises FrameError if the bag has not the one that was asked for.
-    """
+    Raises FrameError if the bag has not the one that was asked for."""
     names = sorted({connection.topic for connection in reader.connections(CAMERA_INFO)})
     listed = ", ".join(names) or "none"
     if wanted is not None:

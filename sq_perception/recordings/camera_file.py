@@ -118,10 +118,8 @@ class CameraInfo:
 def read_calibration(
     source: str | Path, distortion: Treatment = "auto", name: str = "", size: tuple[int, int] | None = None
 ) -> Calibration:
-    """Return the calibration of images called ``name``, as :func:`read_camera_info` has it.
-
-    Raises FrameError as :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
-    """
+    """Return the calibration of images called ``name``, as :func:`read_camera_info` has it.  Raises FrameError as
+    :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known."""
     return calibration(read_camera_info(source, size), source, distortion, name)
 
 

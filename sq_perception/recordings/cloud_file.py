@@ -106,10 +106,8 @@ def _check_size(path: Path) -> None:
 
 
 def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage:
-    """Return the image of points (height, width, 3) and their labels (height, width).
-
-    Raises UnpackingError if they do not lie before a camera in the origin that looks along z.
-    """
+    """Return the image of points (height, width, 3) and their labels (height, width).  Raises UnpackingError if they do
+    not lie before a camera in the origin that looks along z."""
     least = 100
     with np.errstate(all="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
@@ -152,9 +150,7 @@ def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage
 
 def _layered_share(tangents: np.ndarray, z: np.ndarray) -> float:
     """Return the share of points whose neighbours in the image lie on no common plane: those of a front and a back.
-
-    Seven to nine in ten of an object's from all sides, one in five of a sparse one of a crowded table from one.
-    """
+    Seven to nine in ten of an object's from all sides, one in five of a sparse one of a crowded table from one."""
     from scipy.spatial import cKDTree
 
     some = np.linspace(0, len(z) - 1, min(500, len(z))).astype(int)
@@ -299,10 +295,8 @@ def _unpack(packed: np.ndarray, out: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class CloudFrame:
-    """Where the camera is in the frame of a cloud: its place, and its rotation where that is known.
-
-    With R, t the pose of its optical frame in the cloud's frame, p_optical = R^T (p - t), metres.
-    """
+    """Where the camera is in the frame of a cloud: its place, and its rotation where that is known.  With R, t the pose
+    of its optical frame in the cloud's frame, p_optical = R^T (p - t), metres."""
 
     place: tuple[float, ...]
     quaternion: tuple[float, ...] | None

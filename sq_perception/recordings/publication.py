@@ -82,9 +82,7 @@ def identify(
     recovery: FrameRecovery, tracks: Sequence[Followed] | None = None, hidden: tuple[int, ...] = ()
 ) -> Identified:
     """Return bodies and ids of their tracks, of which there is one for each body that did not fail, in their order.
-
-    Without tracks bodies are the frame's, and ids their labels.
-    """
+    Without tracks bodies are the frame's, and ids their labels."""
     if tracks is None:
         reasons = tuple(_reason(body, body.superquadric) for body in recovery.bodies)
         return Identified(recovery, tuple(body.label for body in recovery.bodies), columns={"reason": reasons})
@@ -241,10 +239,8 @@ def _join(meshes: Sequence[Mesh], array: SuperquadricArray) -> MarkerMesh:
 
 
 def covariances(array: SuperquadricArray) -> np.ndarray:
-    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown.
-
-    A message has no correlations, which sizes and centre of a fit have: a seen side is surer, a hidden one less sure.
-    """
+    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown.  A
+    message has no correlations, which sizes and centre of a fit have: a seen side is surer, a hidden one less sure."""
     found = np.zeros((len(array), 11, 11))
     deviations = [np.asarray(each, float) for each in (array.sigma_size, array.sigma_centre, array.sigma_turn)]
     size, centre, turn = (np.where(np.isfinite(each), each**2, np.nan) for each in deviations)

@@ -188,10 +188,8 @@ class ResultBag:
 
 @cache
 def types(name: str) -> Callable[..., Any]:
-    """Return what makes messages of ``package/msg/Name`` from keywords; fields left out have ROS's defaults.
-
-    Raises KeyError for a type that ROS 2 Jazzy's common interfaces do not have.
-    """
+    """Return what makes messages of ``package/msg/Name`` from keywords; fields left out have ROS's defaults.  Raises
+    KeyError for a type that ROS 2 Jazzy's common interfaces do not have."""
     kind, defaults = _STORE.types[name], _defaults(name)
     return lambda **given: kind(**{**defaults, **given})
 

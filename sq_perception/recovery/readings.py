@@ -47,10 +47,8 @@ class Readings:
 
 
 def read(depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: RecoveryOptions) -> Readings:
-    """Check an image and fill its small holes; parameters and errors as those of ``Recoverer.recover``.
-
-    Arrays come out row by row, as kernels are compiled for arrays of a kind.
-    """
+    """Check an image and fill its small holes; parameters and errors as those of ``Recoverer.recover``.  Arrays come
+    out row by row, as kernels are compiled for arrays of a kind."""
     began = time.perf_counter()
     depth = camera.readings(depth)
     farthest = min(GREATEST_DEPTH, float(np.finfo(depth.dtype).max))  # which half precision does not reach

@@ -103,9 +103,7 @@ class Mesh:
 
 def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
     """Render the depth (height, width) of a mesh in the optical frame, seen from both sides; +inf for no surface.
-
-    Raises ValueError for another camera than a pinhole one, or a mesh that is not wholly in front of it.
-    """
+    Raises ValueError for another camera than a pinhole one, or a mesh that is not wholly in front of it."""
     if not camera.is_pinhole or mesh.vertices[:, 2].min() <= 0:
         raise ValueError("expected a pinhole camera and a mesh in front of it")
     depth = np.full((camera.height, camera.width), np.inf)

@@ -70,11 +70,8 @@ def thesis_scene(rng: np.random.Generator) -> Scene:
 
 
 def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:
-    """Draw ``count`` random bodies side by side on a table, all wholly inside the image.
-
-    Raises ValueError if ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its
-    image.
-    """
+    """Draw ``count`` random bodies side by side on a table, all wholly inside the image.  Raises ValueError if
+    ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its image."""
     if not 1 <= count <= 10:
         raise ValueError(f"count: expected 1 to 10 bodies, got {count}")
     if not camera.is_pinhole:
@@ -156,10 +153,8 @@ def inside_image(body: Superquadric, camera: Camera, border: float = 0.0) -> boo
 
 
 def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
-    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.
-
-    Raises ValueError if ``count`` is not 1 to 12, or the bodies do not fit into the image.
-    """
+    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.  Raises
+    ValueError if ``count`` is not 1 to 12, or the bodies do not fit into the image."""
     if not 1 <= count <= MOST:
         raise ValueError(f"count: expected 1 to {MOST} bodies, got {count}")
     for _ in range(10):

@@ -79,9 +79,7 @@ class SensorNoise(ABC):
 
     def sigma(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
         """Return the standard deviation, metres, of a reading at depth z with this cosine of incidence; broadcasts.
-
-        Raises ValueError if a depth is not positive or a cosine not in (0, 1].
-        """
+        Raises ValueError if a depth is not positive or a cosine not in (0, 1]."""
         z, cosine = np.asarray(z, dtype=float), np.asarray(cosine, dtype=float)
         if not (np.isfinite(z) & (z > 0)).all():
             raise ValueError("z: expected positive metres")

@@ -79,9 +79,7 @@ class Thing:
 
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
         """Draw a resting pose, turned about the vertical: its name and the quaternion (4,) to a frame with z up.
-
-        ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them.
-        """
+        ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them."""
         rest = self.rests[draw_index([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
         if rng.random() < leaning:
@@ -139,11 +137,8 @@ SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
-    """Read all meshes of a folder, by name.
-
-    Raises ValueError if there are none, one cannot be read or has no faces, or its size is none that one takes in a
-    hand.
-    """
+    """Read all meshes of a folder, by name.  Raises ValueError if there are none, one cannot be read or has no faces,
+    or its size is none that one takes in a hand."""
     paths = sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in SUFFIXES)
     if not paths:
         raise ValueError(f"{folder}: expected meshes ({' '.join(SUFFIXES)}), found none")

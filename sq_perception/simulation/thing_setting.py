@@ -140,10 +140,8 @@ def optical_from_table(pitch: float, roll: float) -> np.ndarray:
 
 
 def _pitch(ray: np.ndarray, elevation: float, roll: float) -> float:
-    """Return the pitch, radians, of a camera whose ray meets the table at ``elevation``, or as steeply as it can.
-
-    With r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation).
-    """
+    """Return the pitch, radians, of a camera whose ray meets the table at ``elevation``, or as steeply as it can.  With
+    r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation)."""
     x, y, z = ray / np.linalg.norm(ray)
     y = np.cos(roll) * y - np.sin(roll) * x
     return float(np.arcsin(min(np.sin(elevation) / np.hypot(y, z), 1.0)) - np.arctan2(y, z))

@@ -79,10 +79,8 @@ class Pairs(NamedTuple):
 def pairs_in_place(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> Pairs:
-    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap.
-
-    Covariances are (n, 11, 11) and (m, 11, 11); an error that observations have beside theirs is part of the tracks'.
-    """
+    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap.  Covariances are (n, 11, 11) and (m, 11, 11);
+    an error that observations have beside theirs is part of the tracks'."""
     distance = separation(track, observed)
     between = observed[None, :, 5:8] - track[:, None, 5:8]
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
@@ -287,10 +285,8 @@ def loosen_pose(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
 def rename_axes(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An observation (12,) that its track does not follow, and its covariance, with the axes named as the track's.
-
-    The rotation about an axis that the observation leaves open, as of something round, is the track's.
-    """
+    """An observation (12,) that its track does not follow, and its covariance, with the axes named as the track's.  The
+    rotation about an axis that the observation leaves open, as of something round, is the track's."""
     distance = np.linalg.norm(observed[None, 5:8] - track[5:8], axis=-1)
     free = loosen_pose(track_covariance[None], distance)
     (form,), (changed,) = nearest_form(track[None], free, observed[None], covariance[None])

@@ -79,11 +79,8 @@ class Estimate(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """n observations in the forms of their tracks, world frame.
-
-    ``white``, ``common`` and ``shared`` (n, 11, 11) are the covariances W, B and gamma R, ``direction`` (n, 3) leads
-    from the body to the camera.
-    """
+    """n observations in the forms of their tracks, world frame.  ``white``, ``common`` and ``shared`` (n, 11, 11) are
+    the covariances W, B and gamma R, ``direction`` (n, 3) leads from the body to the camera."""
 
     state: np.ndarray
     white: np.ndarray

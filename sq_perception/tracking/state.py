@@ -95,9 +95,7 @@ def diagonal(size: float, shape: float, centre: float, turn: float) -> np.ndarra
 
 def parse_pose(pose: object) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (4,), a quaternion x y z w, and translation (3,) of a 4 x 4 matrix or a pair of them; None: identity.
-
-    Raises ValueError for anything else, numbers that are not finite, or a matrix that is no rigid motion.
-    """
+    Raises ValueError for anything else, numbers that are not finite, or a matrix that is no rigid motion."""
     if pose is None:
         return np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
     if isinstance(pose, tuple | list) and len(pose) == 2:

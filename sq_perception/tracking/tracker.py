@@ -75,10 +75,8 @@ class _Frame(NamedTuple):
 
 
 class Tracker:
-    """Follows bodies; one call of :meth:`update` for each frame.
-
-    What it knows between two frames is frozen: a copy of it goes on by itself.
-    """
+    """Follows bodies; one call of :meth:`update` for each frame.  What it knows between two frames is frozen: a copy of
+    it goes on by itself."""
 
     def __init__(self) -> None:
         self._bodies: _Bodies = ()
