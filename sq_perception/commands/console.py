@@ -146,11 +146,8 @@ def replaced_input(
     inputs: Sequence[Path], files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,
 ) -> str:
-    """Complain if an output would replace an input; empty if none would.
-
-    ``files``: the files that are written, by the option that names each; None if it was not given.  ``folders``: the
-    folders that are written to, likewise, each with the suffix of the files there.
-    """
+    """Complain if an output would replace an input; empty if none would.  ``files`` and ``folders`` are by the option
+    that names each; None if it was not given; of a folder with the suffix of what is written there."""
     for name, file in files.items():
         path = None if file is None or str(file) == STANDARD_OUTPUT else Path(file)
         if path and path.exists() and any(given.exists() and path.samefile(given) for given in inputs):

@@ -125,10 +125,8 @@ class Outputs:
             self._lines.add(entry)
 
     def finish(self, whole: bool) -> Iterator[str]:
-        """Close growing files and write the documents; return one sentence per failure or other destination.
-
-        ``whole``: whether all frames were tried.
-        """
+        """Close growing files and write the documents, ``whole`` if all frames were tried; return a sentence per
+        failure or other destination."""
         if self._lines is not None:
             self._lines.close()
         for name, output in (("mcap", self._bag), ("html", self._page)):

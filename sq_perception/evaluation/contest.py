@@ -189,13 +189,8 @@ def compare(
     contestants: Sequence[tuple[Contestant, int]], images: ThesisImages,
     advance: Callable[[str, int], None] | None = None,
 ) -> list[Outcome]:
-    """Have every contestant recover the first bodies of the test set.
-
-    contestants: Each with the number of its bodies, at most those of the test set.
-    advance: Called with a contestant's name and the number of bodies done.
-
-    Raises ValueError if a contestant is to recover no body, or more than there are.
-    """
+    """Have every contestant recover so many of the first bodies of the test set; ``advance`` is called with its name
+    and the number done.  Raises ValueError for no body, or more than there are."""
     for contestant, count in contestants:
         if not 1 <= count <= images.count:
             raise ValueError(f"{contestant.name}: expected 1 to {images.count} bodies, got {count}")

@@ -94,11 +94,8 @@ class FiguresOfMerit:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Means over a test set, as in the thesis' tables: JSON values by name.
-
-        Shares and relative errors are fractions, angles radians.  Numbers about parameters are over the ``recovered``
-        bodies, times over the ``timed`` ones; NaN where there is none.
-        """
+        """Means over a test set, as in the thesis' tables, JSON values by name: fractions and radians.  Parameters are
+        compared over the ``recovered`` bodies, times over the ``timed`` ones; NaN where there is none."""
         recovered = np.isfinite(self.delta_a)
         times = self.milliseconds[np.isfinite(self.milliseconds)]
         axes = self.axes_angle[recovered]

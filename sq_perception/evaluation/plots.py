@@ -99,11 +99,8 @@ def draw_grasps(
     ax: Axes, depth: np.ndarray, camera: Camera, bodies: Sequence[Superquadric], plan: GraspPlan, hand: Gripper,
     numbers: Sequence[int] | None = None, window: Window | None = None,
 ) -> None:
-    """A depth image, the outlines of its bodies and, at the best grasp of each, the gripper with its probability.
-
-    A body without a grasp has the reason.  ``numbers`` are those of the bodies, 0, 1, ... if not given.  What of a
-    gripper lies beyond the image, or its ``window``, is shown too, up to a quarter of it away.
-    """
+    """A depth image, outlines of its bodies and, at the best grasp of each, the gripper with its probability, or why
+    there is none.  What of a gripper lies beyond the image, or its ``window``, is shown up to a quarter of it away."""
     draw_depth(ax, depth)
     numbers = range(len(bodies)) if numbers is None else numbers
     draw_outlines(ax, bodies, camera, [colour(number) for number in numbers], edges=False, width=1.4)

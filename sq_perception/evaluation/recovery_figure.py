@@ -24,11 +24,8 @@ from sq_perception.segmentation.segments import segment
 def demo_figure(
     depth: np.ndarray, camera: Camera, truth: Sequence[Superquadric], methods: Mapping[str, Sequence[Superquadric]]
 ) -> Figure:
-    """Draw a column for the image and its true bodies, and one a method: outlines above, bodies in space below.
-
-    depth: (height, width), metres, NaN for no reading.
-    truth, methods: Single bodies in the optical frame, those of the methods by title.
-    """
+    """Draw a column for the image (height, width), metres, and its true bodies, and one a method: outlines above,
+    bodies in space below.  Bodies are single ones in the optical frame."""
     columns = {"true bodies": truth, **methods}
     figure = plots.new_figure(5.0 * len(columns), 8.6)
     wires = [line for body in truth for line in outline(body, 64)]

@@ -52,11 +52,8 @@ def kernel(function: _F) -> _F:
 
 
 def parallel_kernel(function: _F) -> _F:
-    """Compile as :func:`kernel`, with ``numba.prange`` over all cores; for callers in Python.
-
-    Threads of numba may serve one call at a time, and end the process that calls them after a fork: calls wait for each
-    other, and a forked process computes on one thread.
-    """
+    """Compile as :func:`kernel`, with ``numba.prange`` over all cores; for callers in Python.  numba serves one call at
+    a time, and ends a process after a fork: calls wait for each other, and a fork computes on one thread."""
     alone = FunctionType(function.__code__, function.__globals__)
     alone.__qualname__ = f"{function.__qualname__}_alone"
     single, shared = _compiled(alone), _compiled(function, parallel=True)
@@ -84,12 +81,9 @@ def _compiled(function: _F, **more: bool) -> _F:
 
 @cache
 def _fingerprint(file: Path) -> str:
-    """A digest of a source file and all those of this package that it imports, directly or through others.
-
-    numba keeps machine code under the name of a function and checks the file that holds it, but not the files of the
-    kernels that were compiled into it: an update of this module alone would leave the old code at work elsewhere.  With
-    the digest in the name, code of other sources is never found.
-    """
+    """A digest of a source file and all those of this package that it imports.  numba checks the file that holds a
+    function, not those of kernels compiled into it: with the digest in the name, code of other sources is never
+    found."""
     known, ahead = {file}, [file]
     while ahead:
         new = _find_imports(ahead.pop()) - known
@@ -256,12 +250,8 @@ def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
 def support_derivatives(
     nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float, k2: float
 ) -> Support:
-    """max n.p over the body, for a direction of any length, and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2, h_k1,
-    h_k2.
-
-    The dual norm, see :meth:`Superquadric.support`.  The derivatives by n are the point of the body that is farthest;
-    that by a half size is dh/da1 = n_x h_nx / a1.
-    """
+    """max n.p over the body, for a direction of any length, see :meth:`Superquadric.support`: h, h_nx, h_ny, h_nz (the
+    point that is farthest), h_e1, h_e2, h_k1, h_k2.  That by a half size is dh/da1 = n_x h_nx / a1."""
     if k1 != 0.0 or k2 != 0.0:
         sines = profile_sines(np.array([[nx], [ny], [nz]]), (a1, a2, a3, e1, e2, k1, k2))
         return support_at(sines[0], nx, ny, nz, a1, a2, a3, e1, e2, k1, k2)

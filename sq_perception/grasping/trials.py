@@ -76,10 +76,7 @@ def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
 
 
 def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = 0.006) -> np.ndarray:
-    """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line.
-
-    As a force, against gravity and a lift with 2 m/s^2, and as a torque that the friction holds by its mean ``arm``,
-    by default that of a pad of some 18 mm.
-    """
+    """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line, with 2
+    m/s^2 and by the torque that it holds with its mean ``arm``, by default that of a pad of some 18 mm."""
     load = np.maximum(1.0, lever / arm) * (9.81 + 2.0) * mass / force
     return log_phi(1 / np.maximum(load, 1e-9) - 1, 0.5)

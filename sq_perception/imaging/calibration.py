@@ -57,17 +57,8 @@ class Calibration:
 
     @classmethod
     def of(cls, info: Any, name: str = "", distortion: Treatment = "auto") -> Calibration:
-        """The calibration of a camera_info.
-
-        Quick: tables are computed for the first image, and calibrations that are equal share them.
-
-        info: Anything with the fields of sensor_msgs/CameraInfo.
-        name: Topic of the images, as it is after remapping, or the path of a file.
-        distortion: See the module.
-
-        Raises ValueError if the camera_info is not usable; the message gives the reason and the setting that might
-        help.
-        """
+        """The calibration of a camera_info, for images of a topic or file of this ``name``; quick, as tables are made
+        for the first image.  Raises ValueError with the reason and the setting that might help."""
         if distortion not in get_args(Treatment):
             raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
         note = ""

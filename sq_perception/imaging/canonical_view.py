@@ -269,11 +269,8 @@ def _nearer(
     depth: np.ndarray, mask: np.ndarray, filled: np.ndarray, lost: np.ndarray, lens: Lens, matrix: np.ndarray,
     plane: np.ndarray, tolerance: float,
 ) -> np.ndarray:
-    """How much nearer than the object, metres, whose depth there is in ``filled``, each reading beside it is.
-
-    -inf at pixels of the object and of the plane.  Where nothing was measured: +inf within the mask and NaN beyond it
-    at the pixels set in ``lost``, -inf at the others.
-    """
+    """How much nearer than the object, whose depth is in ``filled``, each reading beside it is, metres; -inf on object
+    and plane.  Without a reading +inf within the mask and NaN beyond it where set in ``lost``, else -inf."""
     nearer = np.full(depth.shape, np.float32(-np.inf))
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):

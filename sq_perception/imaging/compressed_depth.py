@@ -53,13 +53,8 @@ def size(image_format: str, data: bytes | np.ndarray) -> tuple[int, int]:
 
 
 def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
-    """The numbers (height, width) of the image before it was packed: uint16 of 16UC1, 0 for nothing, or float32 metres
-    of 32FC1, NaN for nothing.
-
-    image_format, data: ``format`` and ``data`` of the sensor_msgs/CompressedImage.
-
-    Raises ValueError for another format, or data that is no such image; the message names what was expected.
-    """
+    """The numbers (height, width) before they were packed, by ``format`` and ``data`` of a CompressedImage: uint16 of
+    16UC1, 0 for nothing, or float32 metres of 32FC1, NaN for nothing.  Raises ValueError for anything else."""
     packed = _known(image_format)
     message = bytes(data)
     if _is_rvl(image_format):

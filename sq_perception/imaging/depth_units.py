@@ -52,11 +52,8 @@ class Stated:
 
 @dataclass(frozen=True, eq=False)
 class Metres:
-    """A depth image, float32 (height, width) in metres, NaN where nothing was measured.
-
-    ``scale`` has the units a metre that were used.  ``notes`` say what was decided that the numbers alone do not show,
-    in the same words for each image of a camera.
-    """
+    """A depth image, float32 (height, width) in metres, NaN where nothing was measured; the units a metre that were
+    used; and ``notes`` on what the numbers alone do not show, in the same words for each image of a camera."""
 
     depth: np.ndarray
     scale: float = 1.0
@@ -78,13 +75,9 @@ def parse_scale(value: float, where: str) -> Stated:
 
 
 def metres(numbers: np.ndarray, scale: float | None = None, known: Stated | None = None) -> Metres:
-    """Depth of the numbers (height, width) of an image, of any real type and byte order.
-
-    scale: Units a metre that the caller asks for: goes before all else.
-    known: What is stated beside the image; of floats it only counts where they can hardly be metres.
-
-    Raises UnitsError for raw disparities.
-    """
+    """Depth of the numbers (height, width) of an image, by the units a metre of the caller, ``scale``, or those
+    ``known`` of its file, which of floats only count where they can hardly be metres.  Raises UnitsError for raw
+    disparities."""
     is_whole = numbers.dtype.kind in "iu"
     notes: list[str] = []
     used = scale or (MILLIMETRES if is_whole else 1.0)

@@ -44,13 +44,8 @@ _OUTSIDE = -9.0  # a column and row that no image has
 
 @dataclass(frozen=True)
 class Rectification:
-    """From a raw camera to the pinhole camera in its place; :func:`rectification` gives one whose tables are kept.
-
-    raw: Size and intrinsics (K) of the raw images; pinhole.
-
-    Raises ValueError if the camera is no pinhole, its images are too large, or the distortion cannot be undone in the
-    middle of it.
-    """
+    """From a raw pinhole camera (K) to the one in its place; :func:`rectification` keeps their tables.  Raises
+    ValueError if the images are too large, or the distortion cannot be undone in the middle."""
 
     raw: Camera
     distortion: Distortion

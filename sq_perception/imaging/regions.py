@@ -28,10 +28,8 @@ def convex_hull(mask: np.ndarray) -> np.ndarray:
 
 
 def extents(labels: np.ndarray) -> np.ndarray:
-    """Size and bounding box of each label, int64 (count + 1, 5); all 0 for label 0 and for labels without pixels.
-
-    In this order: number of pixels, first row, last row + 1, first column, last column + 1.
-    """
+    """Number of pixels, first row, last row + 1, first column and last column + 1 of each label, int64 (count + 1, 5);
+    all 0 for label 0 and for labels without pixels."""
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     return np.asarray(_extents(labels, int(labels.max(initial=0))))
 

@@ -117,13 +117,9 @@ def _module(kind: Any, config: RegressorConfig | ThingConfig | MaskConfig, weigh
 
 
 def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, dict[str, np.ndarray]]:
-    """The form of a network of a kind and its weights by name, in single precision.
-
-    The path is as :func:`resolve` takes it, None for the weights of this kind that are used where none are named.
-
-    Raises CheckpointError if the file is missing, no safetensors file, of another format or version, or does not fit
-    its own config.
-    """
+    """The form of a network and its float32 weights by name; the path is as :func:`resolve` takes it, None for the
+    shipped ones of this kind.  Raises CheckpointError if the file is missing, of another kind, or does not fit its
+    config."""
     path = resolve(_SHIPPED[kind] if path is None else path)
     config = _parse_config(path, read_header(path), kind)
     try:

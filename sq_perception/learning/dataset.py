@@ -137,11 +137,8 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
 
 
 class ViewPool:
-    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions and noise.
-
-    Rendering costs as much as a training step: each batch renders only ``batch / reuse`` new views, which replace the
-    oldest of the pool.
-    """
+    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions and noise.  Each
+    batch renders only ``batch / reuse`` new ones, in place of the oldest: that costs as much as a training step."""
 
     def __init__(
         self, rng: np.random.Generator, source: ViewSource | None = None, capacity: int = POOL, reuse: int = 4

@@ -87,13 +87,8 @@ class ThingPredictor:
     def predict(
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray, mirror: bool = True
     ) -> HullPredictions:
-        """Bodies and hulls of views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown.
-
-        What the things stand on are planes (n, 4) in the frames of the views, zeros where there is none.  Without
-        ``mirror``, only the views themselves: in half of the time.
-
-        Raises ValueError for views of another form, or not finite.
-        """
+        """Bodies and hulls of views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown, on planes (n, 4) in
+        their frames, zeros for none; without ``mirror`` in half of the time.  Raises ValueError for other views."""
         views = check_views(views, self.config.regressor())
         if not mirror:
             of_views = self._network.predict(views, planes.astype(np.float32), extents.astype(np.float32))

@@ -71,11 +71,8 @@ class RegressorConfig:
     def view_of(
         self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
     ) -> CanonicalView:
-        """What a network is shown of the object under a mask; its predictions are in the frame of this view.
-
-        Arguments and errors are those of :func:`canonical_view.from_mask`; a network for full frames knows the unit
-        cube alone and refuses pinhole cameras.
-        """
+        """What a network is shown of the object under a mask, and the frame of its predictions; arguments and errors as
+        of :func:`canonical_view.from_mask`.  A network for full frames refuses pinhole cameras."""
         if self.framing == "full":
             return canonical_view.full_frame(depth, mask, camera, self.pixels)
         hidden = self.marks_hidden
@@ -133,12 +130,8 @@ class MaskConfig:
 
 
 def side_inputs(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:
-    """What the network of things is shown beside views (b, p, p): heights (b, p, p) above planes (b, 4), and logarithms
-    (b,) of the views' sides ``extents`` (b,), metres, 0 for an unknown side.
-
-    Heights are in sides of the view: of the surface that a pixel shows, or, where it shows none, of the point at half
-    of the cube's depth.
-    """
+    """What the network of things is shown beside views (b, p, p): heights above planes (b, 4), in sides of the view, of
+    the surface or else of half the cube's depth, and logarithms (b,) of ``extents``, metres, 0 if unknown."""
     xp, pixels = array_namespace(views), views.shape[-1]
     across = (xp.arange(pixels, dtype=views.dtype, device=device(views)) + 0.5) / pixels
     n = planes[:, :, None, None]

@@ -141,12 +141,9 @@ class TrainingState:
             raise CheckpointError(f"{self.path}: not the state of such a run: {reason}") from error
 
     def descend(self, loss: torch.Tensor, rate: float, keep: float) -> None:
-        """Make a step down the gradient of a loss at this rate, and let the averaged weights follow.
-
-        Early in a run they keep less than ``keep`` of themselves.
-
-        Raises ArithmeticError if the loss or its gradient is not finite; the weights are left as they are.
-        """
+        """Make a step down the gradient of a loss at this rate; averaged weights keep ``keep`` of themselves, less
+        early in a run.  Raises ArithmeticError if the loss or its gradient is not finite; the weights are then as they
+        were."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
@@ -183,11 +180,8 @@ def read_settings(state: Path) -> dict[str, Any]:
 def run(
     state: TrainingState, config: Run, task: Task, advance: Callable[[int, float], None] = lambda step, loss: None
 ) -> Any:
-    """Run a training to its end; returns the averaged network, which the folder of the state keeps.
-
-    Raises ArithmeticError when the loss or a gradient is no longer finite; the last saved state stays as it was;
-    Stopped after SIGINT or SIGTERM; the state is saved first.
-    """
+    """Run a training to its end; returns the averaged network, which the folder of the state keeps.  Raises
+    ArithmeticError when loss or gradient are not finite, Stopped after SIGINT or SIGTERM, when the state is saved."""
     device, losses, rate = next(state.model.parameters()).device, list[float](), 0.0
     began = saved = time.monotonic()
     began -= state.seconds

@@ -139,11 +139,8 @@ def decode(
 
 
 def draw_masks(message: MaskMessage, size: tuple[int, int]) -> np.ndarray:
-    """Draw the masks of a yolo_msgs/DetectionArray as a label image, int32 (height, width).
-
-    Label k is the k-th detection; where two overlap, the one with the higher score is on top.  Raises ValueError if a
-    detection has no mask, or one of an image that is not ``size``, (width, height), pixels.
-    """
+    """Draw the masks of a yolo_msgs/DetectionArray as a label image, int32 (height, width): label k is the k-th
+    detection, the higher score on top.  Raises ValueError for one without a mask, or of an image of another size."""
     labels = np.zeros(size[::-1], np.int32)
     numbered = enumerate(message.detections, start=1)
     for number, detection in sorted(numbered, key=lambda one: float(one[1].score)):

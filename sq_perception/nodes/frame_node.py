@@ -60,11 +60,8 @@ class Outcome(NamedTuple):
 
 
 class FrameNode(ManagedNode):
-    """Node for depth images; ``kind`` is its parameter dataclass, ``defaults`` override some of its defaults.
-
-    Raises ParameterError for a parameter that cannot be used.  A model that is missing or wrong is a fault of the
-    configuration, as it is read there.
-    """
+    """Node for depth images; ``kind`` is its parameter dataclass, ``defaults`` override some of its defaults.  Raises
+    ParameterError; a model that is missing or wrong is a fault of the configuration."""
 
     _action: ActionServer | None = None
 

@@ -36,11 +36,8 @@ instead, a camera that sends so many within ``patience`` would never get an answ
 
 @dataclass(frozen=True)
 class Arrival:
-    """A depth image with its camera_info and mask.
-
-    ``size`` is None for a message that is no image and is refused at once.  ``time`` is its arrival, ``deadline`` the
-    end of its wait for camera_info and mask, seconds of the monotonic clock.
-    """
+    """A depth image with its camera_info and mask; ``size`` is None for a message that is no image and is refused at
+    once.  ``time`` is its arrival, ``deadline`` the end of its wait, seconds of the monotonic clock."""
 
     message: DepthMessage
     size: tuple[int, int] | None
@@ -279,11 +276,8 @@ class Input:
         return has_info and (not arrival.needs_mask or stamp in self._masks)
 
     def _info_for(self, size: tuple[int, int], stamp: int) -> tuple[_Info | None, bool]:
-        """Return the camera_info of an image, or the latest of its size, and whether the image need not wait.
-
-        Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
-        another one's would shift every body.
-        """
+        """Return the camera_info of an image, or the latest of its size, and whether the image need not wait: drivers
+        publish it later, and where it changes another one's would shift every body."""
         fitting = [info for info in self._infos if info.size == size]
         if own := [info for info in fitting if info.stamp == stamp]:
             return own[-1], True

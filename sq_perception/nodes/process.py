@@ -54,11 +54,8 @@ class Stoppable(Protocol):
 
 
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
-    """Create nodes and spin them until they are asked to stop; return the exit code.
-
-    ``create`` imports what the nodes need, so that this function handles signals during the seconds of imports.  Nodes
-    that it has yielded are closed even if a later one cannot be made.
-    """
+    """Create nodes and spin them until they are asked to stop; return the exit code.  ``create`` imports what they
+    need, so that signals are handled meanwhile; what it has yielded is closed even if a later one fails."""
     if importlib.util.find_spec("rclpy") is None:
         print(f"{name} needs ROS 2 in Python: {REMEDY}", file=sys.stderr)
         return 1

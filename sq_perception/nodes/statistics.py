@@ -75,11 +75,8 @@ class Statistics:
         self.count("answered")
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
-        """Return the diagnostics of a node, with ``more`` facts beside the frames.
-
-        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused, doubted,
-        lost or left without a mask since the last status.
-        """
+        """Return the diagnostics of a node, with ``more`` facts.  ``standing`` goes first; without it WARN where frames
+        come and none is answered, or some were refused, doubted, lost or left without a mask since the last status."""
         with self._lock:
             now = self._clock()
             counts, lost = Counter(self._counts), Counter(self._lost)

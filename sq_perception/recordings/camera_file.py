@@ -132,13 +132,8 @@ def calibration(info: CameraInfo, source: str | Path, distortion: Treatment, nam
 
 
 def read_camera_info(source: str | Path, size: tuple[int, int] | None = None, name: str | None = None) -> CameraInfo:
-    """Return the camera of a file, or of four numbers; see the module.
-
-    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
-
-    ``size``: width and height of the images, where nothing states them.  ``name``: of the image without
-    suffix: its number tells which of a scene's cameras it has.  None: any image's will do.
-    """
+    """Return the camera of a file, or of four numbers; see the module.  ``size``: width and height where nothing states
+    them; ``name`` of the image, whose number tells the camera of a scene, None for any."""
     try:
         if not os.path.exists(source) and (numbers := _numbers(str(source))) is not None:
             if len(numbers) != 4:

@@ -191,11 +191,8 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
 
 
 class ResultLines:
-    """A file of JSON lines that grows frame by frame; close it when all is done.  A stream is written to as it is.
-
-    ``done`` has the elements of ``frames`` that were there before.  Raises ResumeError if there is a file of something
-    else, or of other options; OSError if it cannot be written, or another program is writing it.
-    """
+    """A file of JSON lines that grows frame by frame, or a stream; ``done`` has the elements of ``frames`` that were
+    there.  Raises ResumeError for a file of something else or other options, OSError if it cannot be written."""
 
     def __init__(self, path: str | Path, options: Mapping[str, Any]) -> None:
         self._path = Path(path)

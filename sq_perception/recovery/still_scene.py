@@ -187,11 +187,8 @@ def repeat(last: Reference, readings: Readings) -> Repeated:
 def _compare(
     old: np.ndarray, new: np.ndarray, shown: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """What changed between two images (rows, columns), in levels of their noise; None where the camera has moved.
-
-    ``shown`` are the labels of the old one, and ``sigma`` is its noise at one metre.  Returns q (rows, columns),
-    clipped, what patches are taken of (rows, columns), the noise level s, and v.
-    """
+    """What changed between two images (rows, columns) of labels ``shown``, in levels of their noise; None where the
+    camera has moved.  Returns q, clipped, what patches are taken of, the noise level s, and v."""
     # A fourth behind the farthest object and beyond, where tables graze and walls are far, readings come and go.
     reach = 1.25 * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)

@@ -33,16 +33,9 @@ def render_things(
     parts: Superquadric, owner: np.ndarray, cavities: Superquadric, cavity_owner: np.ndarray, camera: Camera,
     table: np.ndarray | None = None, behind: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Render depth and the index of the visible object of every pixel.
-
-    parts, cavities: Batches (k,) and (m,) in the optical frame of a pinhole camera.
-    owner, cavity_owner: int (k,), (m,), the object that each belongs to.
-    table: (4,), a plane n.p + d = 0, n up, that objects stand on.
-    behind: Depth of a wall across the whole image, metres.
-
-    Returns depth, float64 (height, width), metres, +inf where there is nothing, and the visible part's owner, int32
-    (height, width), -1 where there is none.
-    """
+    """Render depth, float64 (height, width), metres, +inf for nothing, and the visible part's owner, int32, -1 for
+    none.  Parts (k,) and cavities (m,) in a pinhole camera's frame before a ``table`` (4,), n up, and a wall at
+    ``behind``."""
     depth, index = render(parts, camera)
     thing = np.append(np.asarray(owner, dtype=np.int32), np.int32(-1))[index]
     if len(cavities):

@@ -60,15 +60,9 @@ class SensorNoise(ABC):
     """A depth sensor; see the module."""
 
     def measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-        """Measure a true depth image: float32 (height, width) metres, NaN for no reading.
-
-        depth: floating (height, width), true depth in metres, +inf or NaN where nothing is seen.
-        camera: Of the image; a pinhole for all sensors but :class:`Ideal`.
-        rng: The same state gives the same image.
-
-        Raises ValueError or TypeError if the image is not of floating numbers or not of the camera's size, shows depths
-        that are not positive to a pinhole camera, or the camera or the generator are of another kind.
-        """
+        """Measure a true depth image (height, width), metres, +inf or NaN for nothing: float32, NaN for no reading.
+        Raises ValueError or TypeError for other numbers, sizes, depths or cameras; only :class:`Ideal` takes
+        orthographic ones."""
         if not isinstance(rng, np.random.Generator):
             raise TypeError(f"rng: expected a numpy.random.Generator, got {type(rng).__name__}")
         depth = np.asarray(depth)

@@ -112,13 +112,9 @@ def things_on_table(
     rng: np.random.Generator, count: int | None = None, camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION, kinds: Sequence[str] | None = None,
 ) -> ThingsOnTable:
-    """Place ``count`` objects, or 1 to 8, of some kinds or of any, on a table, all wholly inside the image.
-
-    The camera is ``elevation`` (least, greatest) degrees above the table.
-
-    Raises ValueError if ``count`` is not 1 to 8, the camera is no pinhole camera, or the objects do not fit into its
-    image.
-    """
+    """Place ``count`` objects, or 1 to 8, of some kinds or any, on a table, all inside the image of a camera
+    ``elevation`` (least, greatest) degrees above it.  Raises ValueError for a wrong count or camera, or if they do not
+    fit."""
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
     if not camera.is_pinhole:

@@ -149,10 +149,8 @@ def _cast(
     body: np.ndarray, turn: np.ndarray, anchor: np.ndarray, side: float, sensed: _Sensed, front: np.ndarray,
     curtain: _Curtain, surface: np.ndarray, reach: np.ndarray,
 ) -> None:
-    """Return what the rays of a view meet: z of the body, :data:`_NOTHING`, or :data:`_BEHIND` an occluder.
-
-    ``reach`` becomes how far in the occluder's direction they are, if there is one.
-    """
+    """Return what the rays of a view meet: z of the body, :data:`_NOTHING`, or :data:`_BEHIND` an occluder; ``reach``
+    becomes how far in its direction they are."""
     pixels = surface.shape[0]
     a1, a2, a3, e1, e2, t1, t2, t3 = body[:8]
     is_pinhole, eye, quantum = sensed

@@ -157,11 +157,8 @@ def _assign(
 
 @kernel
 def cheapest(cost: np.ndarray) -> np.ndarray:
-    """The pairs of rows and columns with the least sum of costs (n, m), n <= m, each row in one: (n, m), bool.
-
-    The Hungarian method with potentials: row after row takes the end of its shortest alternating path to a free column
-    (Kuhn 1955, Jonker and Volgenant 1987).  Row 0 and column 0 stand for none.
-    """
+    """The pairs with the least sum of costs (n, m), n <= m, each row in one: (n, m), bool.  The Hungarian method with
+    potentials and shortest paths (Kuhn 1955, Jonker and Volgenant 1987); row 0 and column 0 stand for none."""
     rows, columns = cost.shape
     of_rows, of_columns = np.zeros(rows + 1), np.zeros(columns + 1)  # potentials
     row_of = np.zeros(columns + 1, dtype=np.int64)

@@ -90,11 +90,8 @@ class Observation(NamedTuple):
 
 
 def update(track: Estimate, seen: Observation, turning: np.ndarray) -> Estimate:
-    """n tracks after one observation each.
-
-    ``turning`` (n,) are bodies that have rotated themselves.  What rotates the estimate of a resting body is a
-    correction: it was seen from the same directions of the world.  A body that rotated shows another side.
-    """
+    """n tracks after one observation each.  ``turning`` (n,) are bodies that have rotated themselves, and so show
+    another side; what rotates the estimate of a resting one is a correction, from the same directions of the world."""
     row = np.arange(len(track.state))
     error = states.difference(track.state, seen.state)
     has_turned = turning[:, None] & (_variances(seen.white + seen.common)[:, TURN] < states.DETERMINED**2)

@@ -202,11 +202,8 @@ def _count_jumps(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
 
 
 def _see_again(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> tuple[_Bodies, Pairs]:
-    """The bodies after answers that repeat earlier ones, and the pairs that are left to be fused.
-
-    A repeated answer is fused all the same if the body moves or was found elsewhere, or if it disagrees with the track,
-    as after a correction of the camera's pose.
-    """
+    """The bodies after answers that repeat earlier ones, and the pairs left to be fused: those of bodies that move,
+    were found elsewhere, or disagree, as after a correction of the camera's pose."""
     if not frame.repeats[pairs.observed].any():
         return bodies, pairs
     agrees = _compare(bodies, pairs)[2].agrees
@@ -247,11 +244,8 @@ def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
 def _doubt(
     bodies: _Bodies, pairs: Pairs, covariances: np.ndarray, white: np.ndarray, whole: np.ndarray, stamp: float
 ) -> tuple[list[Body], np.ndarray]:
-    """The bodies of pairs with what their observations show of motion and doubt, and which of them turn, bool (n,).
-
-    Where an observation disagrees with its track, the covariances (n, 11, 11) of the tracks and the ``white`` ones of
-    the observations grow, in place; ``whole`` (n, 11, 11) are the observations' with the least error.
-    """
+    """The bodies of pairs with what observations show of motion and doubt, and which turn, bool (n,).  Where one
+    disagrees, the tracks' covariances and its ``white`` one grow, in place; ``whole`` are with the least error."""
     some = [bodies[k] for k in pairs.track]
     total, error, verdict = _compare(bodies, pairs)
     turning = np.zeros(len(some), dtype=bool)
