@@ -41,10 +41,8 @@ from sq_perception.recovery.recoverer import FrameRecovery, Method, Recoverer
 from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 
-CAMERA = unit_cube.camera()
-"""The orthographic camera of all images."""
-CHUNK = 200
-"""Images in memory at a time, 50 MB; changes no result."""
+CAMERA = unit_cube.camera()  # the orthographic camera of all images
+CHUNK = 200  # images in memory at a time, 50 MB; changes no result
 
 
 @dataclass(frozen=True)

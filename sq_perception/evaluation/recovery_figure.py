@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from sq_perception.evaluation import plots
-from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.fitting.fit import Status
 from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.mesh import outline
@@ -42,7 +41,7 @@ def demo_figure(
             plots.draw_outlines(above, bodies, camera, width=1.8)
         plots.heading_of(above, title if k else "depth image", "" if k else f"{limits[0]:.2f} to {limits[1]:.2f} m")
         look = {"wires": wires} if k else {"colours": np.array([[0.62, 0.66, 0.7]])}
-        draw_bodies_3d(below, bodies, plane=plane, elevation=25, azimuth=40, **look)
+        plots.draw_bodies_3d(below, bodies, plane=plane, elevation=25, azimuth=40, **look)
         plots.heading_of(below, title, "wires: the true bodies" if k else "seen from the side")
     return figure
 
@@ -85,7 +84,8 @@ def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, 
     clouds = [points[(recovery.labels == body.label) & np.isfinite(depth)] for _, body in shown]
     for k, (elevation, azimuth, name) in enumerate(((24, 28, "From the camera's side"), (12, 90, "From the right"))):
         ax = figure.add_subplot(bottom[k])
-        draw_bodies_3d(ax, bodies, clouds, recovery.plane, shades, elevation=elevation, azimuth=azimuth, unit=unit)
+        place = {"elevation": elevation, "azimuth": azimuth, "unit": unit}
+        plots.draw_bodies_3d(ax, bodies, clouds, recovery.plane, shades, **place)
         plots.heading_of(ax, name, "")
     _draw_numbers(figure.add_subplot(bottom[2]), recovery, unit)
     return figure

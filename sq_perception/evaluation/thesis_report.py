@@ -21,8 +21,7 @@ from sq_perception.evaluation.contest import Outcome, ThesisImages
 
 Entry = Mapping[str, Any]
 """A contestant as results.json has it: name, loss (None for fits), and the summary of its figures."""
-NOTHING = "none given"
-"""What stands in the cells of a row of the thesis that no contestant answers."""
+NOTHING = "none given"  # what stands in the cells of a row of the thesis that no contestant answers
 NOT_IN_THESIS = "not in the thesis"
 
 

@@ -15,12 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-MOST_PIXELS = 2**25
-"""Pixels of an image, or numbers of an array: no depth camera has more."""
-MOST_BYTES = 16 * MOST_PIXELS
-"""Bytes of a file."""
-LONGEST_TEXT = 2**20
-"""Bytes of a YAML, JSON or text."""
+MOST_PIXELS = 2**25  # pixels of an image, or numbers of an array: no depth camera has more
+MOST_BYTES = 16 * MOST_PIXELS  # bytes of a file
+LONGEST_TEXT = 2**20  # bytes of a YAML, JSON or text
 _KINDS = ("PNG", "BMP", "TIFF")
 
 

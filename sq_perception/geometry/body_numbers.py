@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 LENGTHS = {"size": 3, "shape": 2, "translation": 3, "rotation": 4, "taper": 2}
-LARGEST_TAPER = 0.95
-"""Largest |k|: at 1 a body ends in a point, and the equation divides by 0 there."""
+LARGEST_TAPER = 0.95  # largest |k|: at 1 a body ends in a point, and the equation divides by 0 there
 LEAST_CONJUGATE = 1e-3
 """Least 2 - e, the exponent of the dual norm: 0 would be the maximum of an octahedron, from which this differs by at
 most 0.04 % for each norm, and without a division by 0."""

@@ -30,10 +30,8 @@ from sq_perception.geometry.body_numbers import LEAST_CONJUGATE
 from sq_perception.geometry.elementary import ROOT_OF_2, exp2, exp2_to_half, log2, log2_from_1_to_2
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-Triple: TypeAlias = tuple[float, float, float]
-"""A point, a direction or half sizes."""
-Form: TypeAlias = tuple[float, float, float, float, float, float, float]
-"""a1 a2 a3 e1 e2 k_x k_y."""
+Triple: TypeAlias = tuple[float, float, float]  # a point, a direction or half sizes
+Form: TypeAlias = tuple[float, float, float, float, float, float, float]  # a1 a2 a3 e1 e2 k_x k_y
 
 Support: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 """A support function and its derivatives by n_x n_y n_z e1 e2 k_x k_y."""
@@ -109,10 +107,8 @@ RAY_TOLERANCE, MAX_NEWTON_STEPS = 1e-9, 60
 """Tolerance of a ray's entry, as a share of its way through the bounding box, and of the gauge there; most steps."""
 _SINES = tuple(math.sin(math.pi * k / 6) for k in range(-3, 4))
 """Points of a tapered body's profile from which its support is sought, from pole to pole."""
-_SUPPORT_TOLERANCE = 1e-7
-"""Error of the sine at which that search ends: the support is off by its square."""
-_TINY = 1e-145
-"""A number whose square is still a normal one."""
+_SUPPORT_TOLERANCE = 1e-7  # error of the sine at which that search ends: the support is off by its square
+_TINY = 1e-145  # a number whose square is still a normal one
 
 
 @inline_kernel

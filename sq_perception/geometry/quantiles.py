@@ -10,8 +10,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 
-MEDIAN_TO_SIGMA = 1.4826
-"""Standard deviation of normal numbers over the median of their absolute values."""
+MEDIAN_TO_SIGMA = 1.4826  # standard deviation of normal numbers over the median of their absolute values
 
 
 def quantile(numbers: np.ndarray, share: float) -> float:

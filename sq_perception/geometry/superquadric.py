@@ -46,12 +46,10 @@ from array_api_compat import array_namespace, is_torch_array
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, check_turn, floating, one_body
 
-Array = Any
-"""A NumPy array or a torch tensor."""
+Array = Any  # a NumPy array or a torch tensor
 
 NUMBERS = sum(LENGTHS.values())
-FLAT_LENGTH = NUMBERS - LENGTHS["taper"]
-"""Numbers of a body with and without its taper."""
+FLAT_LENGTH = NUMBERS - LENGTHS["taper"]  # numbers of a body with and without its taper
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
 _QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])

@@ -27,8 +27,7 @@ import numpy as np
 from sq_perception.geometry.kernels import gauge_derivatives, kernel, support_derivatives
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
-UNKNOWN = 0.1
-"""Default standard deviation, as a share of a half size."""
+UNKNOWN = 0.1  # default standard deviation, as a share of a half size
 
 
 def _directions() -> np.ndarray:

@@ -58,10 +58,8 @@ from sq_perception.grasping.trials import (
 )
 from sq_perception.imaging.camera import Camera
 
-FRICTION = 0.5
-"""Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
-PER_BODY = 8
-"""Maximum number of grasps returned per body."""
+FRICTION = 0.5  # smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1
+PER_BODY = 8  # maximum number of grasps returned per body
 PLACEMENT = 0.002
 """Standard deviation of the hand's position along each axis, metres: a careful calibration of camera and arm."""
 
@@ -136,7 +134,10 @@ def grasps(
     whole[np.setdiff1d(whole, np.flatnonzero(np.bincount(things)[things] == 1))] = -1
     trials = _trials(known, _loads(bodies, things, whole), closings, gripper, around, friction, placement)
     reasons[things[closings.owner]] = "no way for the fingers to come with the table and the palm in their way"
-    reasons[np.setdiff1d(things, things[~_are_behind(known, around.plane)])] = "behind the plane that bodies stand on"
+    if around.plane is not None:
+        top, _ = known.reaches(np.arange(len(bodies)), np.tile(around.plane[:3], (len(bodies), 1)))
+        is_behind = known.middle @ around.plane[:3] + top + around.plane[3] < 0
+        reasons[np.setdiff1d(things, things[~is_behind])] = "behind the plane that bodies stand on"
     checked = 200  # grasps per body whose distance to other bodies is computed
     trials = _narrow_sides(known, trials.first(checked), gripper, placement)
     trials = _keep_probable(trials, things, checked, reasons, "nothing holds")
@@ -157,14 +158,6 @@ def _loads(bodies: Superquadric, things: np.ndarray, whole: np.ndarray) -> np.nd
     of_thing = np.bincount(things, mass)
     moment = np.stack([np.bincount(things, mass * along) for along in bodies.translation.T], axis=1)
     return np.column_stack([of_thing, moment / of_thing[:, None]])[things]
-
-
-def _are_behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
-    """Return which bodies (n,) lie wholly behind the plane."""
-    if plane is None:
-        return np.zeros(len(bodies), dtype=bool)
-    top, _ = bodies.reaches(np.arange(len(bodies)), np.tile(plane[:3], (len(bodies), 1)))
-    return np.asarray(bodies.middle @ plane[:3] + top + plane[3] < 0)
 
 
 def _keep_probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:

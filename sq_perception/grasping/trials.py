@@ -9,12 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-DENSITY = 500.0
-"""Density of objects, kg/m^3, between empty and full packages; the sigma of a mass is half of it."""
-CLEARANCE = 0.005
-"""Clearance on either side of the body and before the palm, metres."""
-LEAST_ENGAGED = 0.004
-"""Smallest length of finger beyond the near end, metres."""
+DENSITY = 500.0  # density of objects, kg/m^3, between empty and full packages; the sigma of a mass is half of it
+CLEARANCE = 0.005  # clearance on either side of the body and before the palm, metres
+LEAST_ENGAGED = 0.004  # smallest length of finger beyond the near end, metres
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
 """Standard deviation, metres, to which thinned points tell where an object's side is that the image shows a finger to

@@ -34,18 +34,13 @@ from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.raycast import point_at
 
-MARGIN = 1.06
-"""Side of the cube over the side of what is seen in it."""
+MARGIN = 1.06  # side of the cube over the side of what is seen in it
 
-HIDDEN = -0.5
-"""Value of a pixel at which the object may go on unseen, in views that distinguish this from background."""
-FLUSH = -0.25
-"""Value of a pixel beside the object that is as near as its edge, in views that show steps."""
-COVERED = -1.5
-"""Value of a pixel of the object's mask at which nothing was measured, in views that show steps."""
+HIDDEN = -0.5  # value of a pixel at which the object may go on unseen, in views that distinguish this from background
+FLUSH = -0.25  # value of a pixel beside the object that is as near as its edge, in views that show steps
+COVERED = -1.5  # value of a pixel of the object's mask at which nothing was measured, in views that show steps
 
-NEAREST = 0.5 * (1 + 1 / MARGIN)
-"""z0: the value of the object's nearest point."""
+NEAREST = 0.5 * (1 + 1 / MARGIN)  # z0: the value of the object's nearest point
 OUTLIERS_PER_END = 1 / 500
 """Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
 _NEARER = 0.04  # share of the view's side by which something nearer than the object hides what is behind it

@@ -23,8 +23,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-STEP = 0.015
-"""Share of the depth by which neighbouring pixels of one surface differ at most."""
+STEP = 0.015  # share of the depth by which neighbouring pixels of one surface differ at most
 
 
 def edges(filled: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:

@@ -20,8 +20,7 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 
-STEEPEST = 10.0
-"""Tangent of the incidence, of 84 degrees, beyond which neighbouring pixels show two surfaces: a jump."""
+STEEPEST = 10.0  # tangent of the incidence, of 84 degrees, beyond which neighbouring pixels show two surfaces: a jump
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.inverse_depth import STEEPEST
 
-LARGEST_SIDE = 2**15 - 2
-"""Largest side of an image that OpenCV can look up, pixels."""
+LARGEST_SIDE = 2**15 - 2  # largest side of an image that OpenCV can look up, pixels
 _OUTSIDE = -9.0  # a column and row that no image has
 
 

@@ -40,8 +40,7 @@ FORMAT, THING_FORMAT, MASK_FORMAT = "sq_perception.regressor", "sq_perception.th
 _FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT, MaskConfig: MASK_FORMAT}
 Config = TypeVar("Config", RegressorConfig, ThingConfig, MaskConfig)
 VERSION = "1"
-DEFAULT = "robust"
-"""Name of the weights that predict a body where none are named."""
+DEFAULT = "robust"  # name of the weights that predict a body where none are named
 _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things", MaskConfig: "masks"}
 """Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000

@@ -19,12 +19,9 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning.choices import Backbone, Framing
 
-Array = Any
-"""A NumPy array or a torch tensor."""
-BODY_OUTPUTS = 14
-"""Numbers of a body: size 3, shape 2, translation 3, rotation 6."""
-PLANE, EXTENT = 4, 1
-"""Inputs of the network of things beside the view."""
+Array = Any  # a NumPy array or a torch tensor
+BODY_OUTPUTS = 14  # numbers of a body: size 3, shape 2, translation 3, rotation 6
+PLANE, EXTENT = 4, 1  # inputs of the network of things beside the view
 LEAST_LOG, MOST_LOG = -5.0, 0.5
 """Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
 

@@ -33,8 +33,7 @@ from sq_perception.simulation.scenes import TABLE_CAMERA
 
 _MADE_OF = ("device", "threads", "method", "model")  # parameters that determine a recoverer
 
-Answer: TypeAlias = tuple[FrameRecovery, Hashable]
-"""The bodies of a frame, and a value that is equal for equal origins."""
+Answer: TypeAlias = tuple[FrameRecovery, Hashable]  # the bodies of a frame, and a value that is equal for equal origins
 
 
 class Turns:
@@ -67,8 +66,7 @@ class Turns:
             self.take()
 
 
-TURNS = Turns()
-"""The lock of this process."""
+TURNS = Turns()  # the lock of this process
 _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
 
 

@@ -149,8 +149,7 @@ def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescripto
     return descriptor
 
 
-RAW, POINTS = "raw", "points"
-"""Plain images, and clouds of points, as image_transport names them."""
+RAW, POINTS = "raw", "points"  # plain images, and clouds of points, as image_transport names them
 EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
 _KEEPS_ALL = 100.0  # metres: the value of depth_max that keeps all readings
 

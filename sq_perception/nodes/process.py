@@ -36,8 +36,7 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_F
 """Spinning threads take cores from other nodes, and small solves and images gain nothing from a second thread."""
 
 _Node = TypeVar("_Node", bound="Stoppable")
-REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-"""Advice if rclpy is missing."""
+REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"  # advice if rclpy is missing
 
 
 class Stoppable(Protocol):

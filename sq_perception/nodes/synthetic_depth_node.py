@@ -110,8 +110,7 @@ class SourceFrame(RecordedFrame):
     truth: Superquadric | None = None
 
 
-Maker = Callable[[int], SourceFrame]
-"""Makes the k-th image without noise, the same one for each call."""
+Maker = Callable[[int], SourceFrame]  # makes the k-th image without noise, the same one for each call
 
 
 class FrameSource:

@@ -23,8 +23,7 @@ from sq_perception.imaging import compressed_depth
 from sq_perception.recordings import publication
 from sq_perception.recordings.frame_file import FrameError, Stamp
 
-LARGEST = MOST_BYTES
-"""Bytes of one message, or of one unpacked chunk of messages."""
+LARGEST = MOST_BYTES  # bytes of one message, or of one unpacked chunk of messages
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # what a message that was packed by itself begins with; a plain one begins with the byte 0

@@ -26,11 +26,9 @@ from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.tracking.state import parse_pose
 
 SUFFIXES = (".pcd", ".ply")
-LABEL_FIELDS = ("instance", "label")
-"""Fields with the object of each point; the first of them that is there counts."""
+LABEL_FIELDS = ("instance", "label")  # fields with the object of each point; the first of them that is there counts
 LABELLED = "the labels of the points are the masks of objects (ignore masks: segment instead)"
-MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")
-"""Files that may hold a mesh; a PLY or OBJ may be a cloud as well."""
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")  # files that may hold a mesh; a PLY or OBJ may be a cloud as well
 UNORGANISED = (
     "a cloud that is no image, seen from its origin, without points more than 60 degrees off its axis: nothing is "
     "known of the space beside an object, so that the side that is not seen is less sure; a depth image or an "

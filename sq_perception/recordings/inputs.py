@@ -38,12 +38,9 @@ SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 """A file with its camera, or what cannot be read, and why."""
 _log = logging.getLogger(__name__)
-ANY_SIZE = (640, 480)
-"""Pixels, of images that nothing is known of yet."""
-INTERVAL = 0.1
-"""Seconds."""
-Pose = tuple[np.ndarray, np.ndarray]
-"""Quaternion x y z w (4,), translation (3,)."""
+ANY_SIZE = (640, 480)  # pixels, of images that nothing is known of yet
+INTERVAL = 0.1  # seconds
+Pose = tuple[np.ndarray, np.ndarray]  # quaternion x y z w (4,), translation (3,)
 
 
 class RecordedInput:

@@ -30,8 +30,7 @@ from sq_perception.imaging.depth_units import Metres, Stated
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, edges_as_text
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
 
-CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
-"""Frame ids of images that bring none."""
+CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"  # frame ids of images that bring none
 
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 _CENTRE = slice(5, 8)
@@ -41,8 +40,7 @@ _OF_A_BODY = ("size", "shape", "translation", "rotation")
 _OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label", "objectness")
 """Columns of a message that are attributes of a recovery of the same name."""
 
-Mesh = tuple[np.ndarray, np.ndarray]
-"""Vertices (k, 3) and faces (m, 3) of vertex indices."""
+Mesh = tuple[np.ndarray, np.ndarray]  # vertices (k, 3) and faces (m, 3) of vertex indices
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,8 +54,7 @@ except ImportError as missing:
 
 BagImage = Literal["depth", "rendered", "labels"]
 SUFFIX = ".mcap"
-CHUNK_BYTES = 4 * 2**20
-"""Bytes of messages in a chunk: enough to pack well, little to lose."""
+CHUNK_BYTES = 4 * 2**20  # bytes of messages in a chunk: enough to pack well, little to lose
 SUPERQUADRICS, MARKERS = "/recover_node/superquadrics", "/recover_node/markers"
 RENDERED, LABELS, DEPTH = "/recover_node/rendered_depth", "/mask/image", "/depth/image"
 _SECOND = 10**9

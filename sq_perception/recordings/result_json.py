@@ -32,10 +32,8 @@ from sq_perception.tracking.tracker import Track
 
 FORMAT = "sq_perception.recovery"
 VERSION = 1
-UNITS = {"optical": "m", "cube": "1"}
-"""Units of lengths, by a frame's coordinates."""
-LARGEST = 2**30
-"""Bytes of a file of lines that is resumed: some 10^5 frames."""
+UNITS = {"optical": "m", "cube": "1"}  # units of lengths, by a frame's coordinates
+LARGEST = 2**30  # bytes of a file of lines that is resumed: some 10^5 frames
 
 
 class ResumeError(ValueError):

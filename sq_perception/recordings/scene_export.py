@@ -31,8 +31,7 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, triangles
 from sq_perception.geometry.superquadric import Superquadric
 
-SUFFIXES = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml", "curobo": ".yml"}
-"""Of the file of each format."""
+SUFFIXES = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml", "curobo": ".yml"}  # of the file of each format
 CAPSULE, MESH = "capsule", "mesh"
 
 

@@ -25,8 +25,7 @@ from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.options import SegmentationOptions, across
 from sq_perception.segmentation.support_plane import TOLERANCE
 
-_HOVERING = 0.02
-"""An object this many metres above its plane, by its lowest points, may stand on another surface."""
+_HOVERING = 0.02  # an object this many metres above its plane, by its lowest points, may stand on another surface
 
 
 def support(

@@ -327,8 +327,7 @@ def _average(rng: np.random.Generator, shape: tuple[int, ...], window: tuple[int
     return mean[top : top + shape[0], left : left + shape[1]] / np.float32(np.sqrt(columns * rows))
 
 
-IDEAL = "ideal"
-"""Name of the sensor with Gaussian noise and nothing else, whose noise the user chooses."""
+IDEAL = "ideal"  # name of the sensor with Gaussian noise and nothing else, whose noise the user chooses
 PRESETS: Mapping[str, SensorNoise] = {
     # Kinect for Xbox 360, Xtion and their kin, in the infrared camera's own view.  Noise and edges: Nguyen et al.
     # Steps and range: Khoshelham & Elberink (2.85 mm at 1 m, which is 1/8 pixel; 0.5 to 5 m).  Window: autocorrelation

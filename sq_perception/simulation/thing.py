@@ -29,8 +29,7 @@ from sq_perception.geometry.union import flat_support, support_of_union
 from sq_perception.simulation.rendering import Mesh
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
-"""The object's x axis points up: it lies on a side."""
+ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])  # the object's x axis points up: it lies on a side
 ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """The object's y axis, of an oval bottle the shorter one, points up."""
 INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
@@ -43,8 +42,7 @@ ROUND_RESTS = (("standing", UPRIGHT, 0.78), ("lying", ON_Y, 0.19), ("inverted", 
 OVAL_RESTS = (("standing", UPRIGHT, 0.75), ("lying", ON_Y, 0.2), ("on its side", ON_X, 0.05))
 
 Numbers = Sequence[float] | np.ndarray
-Row = tuple[float, ...]
-"""A part: a1 a2 a3 e1 e2 x y z qx qy qz qw."""
+Row = tuple[float, ...]  # a part: a1 a2 a3 e1 e2 x y z qx qy qz qw
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,11 +33,9 @@ from sq_perception.simulation.thing import SIX_WAYS, Thing
 from sq_perception.simulation.thing_setting import level_directions, optical_from_table
 
 MOST_THINGS = 8
-TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
-"""VGA, 60 degrees wide."""
+TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)  # VGA, 60 degrees wide
 
-ELEVATION = (20.0, 70.0)
-"""Degrees."""
+ELEVATION = (20.0, 70.0)  # degrees
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many an object can neither lean nor be stacked where it is tried."""
 _UP = 128

@@ -52,8 +52,7 @@ from sq_perception.geometry.kernels import inline_kernel, kernel, support
 from sq_perception.tracking import state
 from sq_perception.tracking.state import CENTRE, HAND, LENGTH, SHAPE, SIZE, SIZE_AND_SHAPE, TURN
 
-DEEP = 0.5
-"""D over both supports, 1 where bodies touch, below which they are in one place: no two things are.  Chosen."""
+DEEP = 0.5  # d over both supports, 1 where bodies touch, below which they are in one place: no two things are.  Chosen.
 
 
 class Pairs(NamedTuple):
@@ -238,8 +237,7 @@ def _rotations() -> np.ndarray:
 
 
 TURNS = _rotations()
-EXACT = 8
-"""The number of rotations that describe the same body."""
+EXACT = 8  # the number of rotations that describe the same body
 _QUATERNIONS = quaternions.from_matrix(TURNS)
 _CHANGES = np.zeros((len(TURNS), LENGTH, LENGTH))  # what the renaming of axes makes of an error
 _CHANGES[:, range(3, 8), range(3, 8)] = 1

@@ -39,8 +39,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state as states
 from sq_perception.tracking.state import CENTRE, LENGTH, TURN
 
-VIEWS = 16
-"""Directions that are kept for each body: two thirds of a circle at VIEW_ANGLE."""
+VIEWS = 16  # directions that are kept for each body: two thirds of a circle at VIEW_ANGLE
 
 
 class Estimate(NamedTuple):

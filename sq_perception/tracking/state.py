@@ -21,8 +21,7 @@ from sq_perception.geometry.superquadric import Superquadric
 LENGTH = 11
 SIZE, SHAPE, CENTRE, TURN = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11)
 SIZE_AND_SHAPE, POSE = slice(0, 5), slice(5, 11)
-HAND = 1.0
-"""Metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down."""
+HAND = 1.0  # metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down.
 DETERMINED = 0.2
 """Standard deviation in radians up to which a rotation about an axis counts as measured.  Chosen: three of them stay
 below the 45 degrees at which another axis of the body is nearer."""

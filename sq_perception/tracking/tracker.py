@@ -37,14 +37,12 @@ __all__ = ["Track", "TrackState", "Tracker"]
 COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
 """rho and gamma, the shares of an observation's covariance that views from one direction, and all views, have in
 common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
-PREDICTED_SHARE = 0.6
-"""gamma of bodies beside a predicted hull, which errs alike in all frames."""
+PREDICTED_SHARE = 0.6  # gamma of bodies beside a predicted hull, which errs alike in all frames
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
-FORGET_AFTER = 30.0
-"""Seconds without observation until a body is given up.  Chosen."""
+FORGET_AFTER = 30.0  # seconds without observation until a body is given up.  Chosen.
 MOST = 100
 """Tracks that are kept; beyond them those die first that were not observed for longest.  Bounds the time of a frame."""
 _Bodies = tuple[Body, ...]
