@@ -84,8 +84,9 @@ def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, 
     clouds = [points[(recovery.labels == body.label) & np.isfinite(depth)] for _, body in shown]
     for k, (elevation, azimuth, name) in enumerate(((24, 28, "From the camera's side"), (12, 90, "From the right"))):
         ax = figure.add_subplot(bottom[k])
-        place = {"elevation": elevation, "azimuth": azimuth, "unit": unit}
-        plots.draw_bodies_3d(ax, bodies, clouds, recovery.plane, shades, **place)
+        plots.draw_bodies_3d(
+            ax, bodies, clouds, recovery.plane, shades, elevation=elevation, azimuth=azimuth, unit=unit
+        )
         plots.heading_of(ax, name, "")
     _draw_numbers(figure.add_subplot(bottom[2]), recovery, unit)
     return figure
