@@ -87,12 +87,18 @@ def judge(likely: float, fit: Fit, pixels: float, larger: Iterable[tuple[float, 
     affinity and fit of objects with more pixels, of the surest of which it may be a fragment."""
     body, others = fit.superquadric, [(q, each) for q, each in larger if each.status != Status.FAILED]
     affinity, whole = max(others, key=lambda other: other[0], default=(0.0, None))
-    overlap = 0.0
-    if whole is not None:
-        eta, omega = np.meshgrid(np.linspace(-1.4, 1.4, 9), np.linspace(-np.pi, np.pi, 16, endpoint=False))
-        overlap = float((whole.superquadric.gauge(body.parametric_points(eta.ravel(), omega.ravel())) < 1).mean())
+    overlap = 0.0 if whole is None else _share_inside(body, whole.superquadric)
     uncertainty = float(np.max(fit.sigma_size / body.size))
     return objectness.posterior(likely, uncertainty, pixels, affinity, overlap)
+
+
+def _share_inside(body: Superquadric, other: Superquadric) -> float:
+    """The share of a body's surface, evenly in its angles, that lies inside of another."""
+    radii = sum(np.linalg.norm(each.size) * (1 + np.abs(each.taper).max()) for each in (body, other))
+    if np.linalg.norm(body.translation - other.translation) > radii:
+        return 0.0
+    eta, omega = np.meshgrid(np.linspace(-1.4, 1.4, 9), np.linspace(-np.pi, np.pi, 16, endpoint=False))
+    return float((other.gauge(body.parametric_points(eta.ravel(), omega.ravel())) < 1).mean())
 
 
 def _predict(obj: SeenObject) -> Fit:
