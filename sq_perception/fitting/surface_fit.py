@@ -113,8 +113,7 @@ def fit(
     solution = _solve(task)
     if solution is None:
         observation = crop.observe(options.model_error or 0.0, options.nan_is_empty, options.plane)
-        body = starts.enclosing_box(observation.points, observation.footprint)
-        return fail(body, observation, _why_not(observation), began)
+        return fail(observation.points, observation.footprint, observation.sigma, _why_not(observation), began)
     return assess(solution, began)
 
 
