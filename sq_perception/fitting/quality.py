@@ -27,7 +27,7 @@ import numpy as np
 from sq_perception.fitting.cost import SAMPLE, STEP_LENGTH, Ray, Terms
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
+from sq_perception.fitting.observation import OUTLIER_SHARE, span
 from sq_perception.fitting.priors import hull_cost, hull_distances
 from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.fitting.starts import enclosing_box
