@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from sq_perception.fitting import course
+from sq_perception.fitting import surface_fit
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.multistart import Problem, alike
 from sq_perception.fitting.observation import Crop
@@ -69,7 +69,7 @@ def problem_of(body: Superquadric) -> Problem:
     depth, index = raycast.render(Superquadric.stack([body]), CAMERA)
     crop = Crop.around(np.where(index >= 0, depth, 1.0), index >= 0, CAMERA, 1e-4)
     assert crop is not None
-    return course.problem_of(crop.observe(0.0, None), FitOptions(), 0.0)
+    return Problem.of(crop.observe(0.0, None), FitOptions(), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -78,9 +78,9 @@ def problem_of(body: Superquadric) -> Problem:
 def test_a_reading_that_gets_no_smaller_is_the_last(monkeypatch: pytest.MonkeyPatch, readings: list[float]) -> None:
     problem = problem_of(BODY)
     left = iter(readings)
-    monkeypatch.setattr(course, "_outline_sigma", lambda *_: next(left))
+    monkeypatch.setattr(surface_fit, "_outline_sigma", lambda *_: next(left))
     rays = problem.draw(100, 0.3)
-    _, state = course.sharpen_outline(problem, State.of(BODY), rays.free, rays)
+    _, state = surface_fit.sharpen_outline(problem, State.of(BODY), rays.free, rays)
     assert np.isfinite(state.parameters).all()
 
 
@@ -90,5 +90,5 @@ def test_a_body_that_sticks_out_loosens_no_outline(longer: float) -> None:
     problem = problem_of(BODY)
     body = Superquadric(longer * BODY.size, BODY.shape, BODY.translation, BODY.rotation)
     rays = problem.draw(500, 0.3)
-    read, _ = course.sharpen_outline(problem, State.of(body), rays.free, rays)
+    read, _ = surface_fit.sharpen_outline(problem, State.of(body), rays.free, rays)
     assert read.terms.outline_stiffness >= problem.terms.outline_stiffness

@@ -505,7 +505,7 @@ def test_an_object_of_a_camera_has_the_deviations_of_things(monkeypatch: pytest.
     depth, mask = pinhole_image(body)
     depth = depth + np.random.default_rng(3).normal(0, 0.001, depth.shape).astype(np.float32)
     sigmas = []
-    for factor in (surface_fit.course.SPREAD, 1.0):
-        monkeypatch.setattr(surface_fit.course, "SPREAD", factor)
+    for factor in (surface_fit.SPREAD, 1.0):
+        monkeypatch.setattr(surface_fit, "SPREAD", factor)
         sigmas.append(surface_fit.fit(depth, mask, CAMERA).sigma_size)
     assert (sigmas[0] > 2 * sigmas[1]).all()
