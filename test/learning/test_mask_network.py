@@ -52,13 +52,10 @@ def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Gene
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert records[-1]["outliers"] == pytest.approx(1, abs=0.1)
     assert records[-1]["left"] < records[-1]["outliers"]
-    again = checkpoint.load_masks(tmp_path / "run" / "masks.safetensors")
-    assert again.config == SMALL == network.config
+    assert checkpoint.load_masks(tmp_path / "run" / "masks.safetensors").config == SMALL == network.config
 
 
-def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(tmp_path, rng, monkeypatch) -> None:
     """Two of five, or one that is larger than all that may be held; others after each validation."""
     shards(tmp_path / "views", 6, rng)
     size, read = (tmp_path / "views" / "00000.safetensors").stat().st_size, []
@@ -84,9 +81,7 @@ def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
         assert {shard for pool in pools for shard in pool} == {f"{k:05d}" for k in range(1, 6)}
 
 
-def test_too_few_views_are_refused_and_a_shard_that_is_being_written_is_not_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator
-) -> None:
+def test_too_few_views_are_refused_and_a_shard_that_is_being_written_is_not_read(tmp_path, capsys, rng) -> None:
     tmp_path.joinpath("empty").mkdir()
     shards(tmp_path / "views", 2, rng)
     with output_file.writing(tmp_path / "views" / "00002.safetensors"):
@@ -116,9 +111,7 @@ def test_a_damaged_shard_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("truth", np.zeros((), np.uint8)),
     ],
 )
-def test_a_shard_of_another_form_is_named(
-    tmp_path: Path, rng: np.random.Generator, name: str, wrong: np.ndarray
-) -> None:
+def test_a_shard_of_another_form_is_named(tmp_path, rng, name, wrong) -> None:
     shards(tmp_path / "views", 3, rng)
     path = tmp_path / "views" / "00001.safetensors"
     save_file({**load_file(str(path)), name: wrong}, str(path))
@@ -127,9 +120,7 @@ def test_a_shard_of_another_form_is_named(
 
 
 @pytest.mark.parametrize("filled", [False, True])
-def test_shards_without_a_view_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator, filled: bool
-) -> None:
+def test_shards_without_a_view_are_named(tmp_path, capsys, rng, filled) -> None:
     """All of them, or those that are kept for validation."""
     shards(tmp_path / "views", 3, rng)
     for k in range(2 if filled else 3):

@@ -1,18 +1,13 @@
 """What is a thing: its height over its whole area, what is too large and what is alone, and what is said of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou, ious, judged_by_network
 
-from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.segmentation import objectness
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.segments import segment
-
-CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 
 
 @pytest.mark.parametrize("height", [0.004, 0.01])
