@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save_file
 
 from sq_perception.commands import main
 from sq_perception.files import output_file
-from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
+from sq_perception.imaging.segment_view import CHANNELS, MEASURED, OTHERS, PIXELS, SEGMENT
 from sq_perception.learning import checkpoint, shard_training
 from sq_perception.learning.network_config import MaskConfig
 from sq_perception.learning.networks import MaskNetwork
@@ -42,6 +42,25 @@ def test_the_loss_is_a_weighted_cross_entropy() -> None:
     expected = (inside + shard_training.AROUND * beside) / (1 + shard_training.AROUND)
     assert float(shard_training.mask_loss(logits, (images,), truth)) == pytest.approx(expected, rel=1e-6)
     assert float(shard_training.mask_loss(logits, (images,), torch.full_like(truth, UNKNOWN))) == 0
+
+
+def test_a_hidden_label_takes_readings_and_tells_nothing_about_them(rng: np.random.Generator) -> None:
+    """A square segment of one object; what is beyond a band may become another segment, and is the object's still."""
+    shown, parted = set(range(CHANNELS)) - set(shard_training.HIDDEN), 0
+    for _ in range(60):
+        image, truth = np.ones((PIXELS, PIXELS, CHANNELS), np.float32), np.full((PIXELS, PIXELS), NO, np.uint8)
+        image[..., [SEGMENT, OTHERS]] = 0
+        image[20:44, 20:44, SEGMENT], truth[20:44, 20:44] = 1, YES
+        shard_training.hide_label(image, truth, rng)
+        gone = image[..., MEASURED] == 0
+        assert 0 < np.count_nonzero(gone) < 24 * 24
+        assert (image[gone][:, shard_training.HIDDEN] == 0).all()
+        assert (truth == np.where(gone, UNKNOWN, np.where(truth == NO, NO, YES))).all()
+        assert (image[..., sorted(shown)] == 1).all()
+        both = image[..., SEGMENT] + image[..., OTHERS]
+        assert (both[20:44, 20:44] == ~gone[20:44, 20:44]).all()
+        parted += image[..., OTHERS].any()
+    assert 5 < parted < 40
 
 
 def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
