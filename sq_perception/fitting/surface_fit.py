@@ -376,7 +376,7 @@ def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
 def _outline_sigma(problem: Problem, state: State, free: np.ndarray) -> float:
     """Standard deviation of the outline, metres, from how far the body reaches into free rays beside the mask."""
     # A perfect one covers exactly the centres of the mask's pixels: a uniform error of up to half a pixel.
-    sharp = problem.observation.footprint / math.sqrt(12)
+    sharp = 0.3 * problem.observation.footprint
     if len(free) == 0:
         return sharp
     depth = penetration(free, problem.terms, state.parameters, state.rotation)
