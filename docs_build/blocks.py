@@ -170,14 +170,14 @@ def package_layers() -> tuple[tuple[str, ...], ...]:
 
 
 def packages() -> str:
-    """The subpackages with their layer and, from their docstring, their purpose; the highest layer first."""
+    """The subpackages, layers in brackets, with their purpose from their docstring; the highest layer first."""
     layers = package_layers()
     rows = (
-        f"{number} | [`{name}/`](../sq_perception/{name}/__init__.py) | {purpose(name)}"
+        f"- [`{name}/`](../sq_perception/{name}/__init__.py) ({number}): {purpose(name)}"
         for number in range(len(layers), 0, -1)
         for name in layers[number - 1]
     )
-    return table("layer | package | holds", rows)
+    return "\n".join(rows)
 
 
 def purpose(package: str) -> str:

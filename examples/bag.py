@@ -6,7 +6,7 @@ import sq_perception as sq
 from sq_perception.recordings.frame_file import RecordedFrame, Stamp
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recordings.result_bag import ResultBag
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 from sq_perception.tracking.session import TrackingSession
 
 recoverer = sq.Recoverer()

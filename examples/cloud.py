@@ -5,7 +5,7 @@ import numpy as np
 import sq_perception as sq
 from sq_perception.recordings.cloud_file import CloudFrame
 from sq_perception.recordings.frame_file import Reading
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 
 made = sample()
 v, u = np.nonzero(np.isfinite(made.depth))

@@ -1,7 +1,7 @@
 """From a depth image to bodies with standard deviations."""
 
 import sq_perception as sq
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 
 frame = sample()  # or sq.read_frame("table.npz"): depth (height, width) in metres and a camera
 found = sq.Recoverer().recover(frame.depth, frame.camera)

@@ -6,7 +6,7 @@ import sq_perception as sq
 from sq_perception.grasping.gripper import PANDA
 from sq_perception.grasping.planner import grasps_of
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 
 frame = sample()
 found = sq.Recoverer().recover(frame.depth, frame.camera, options=sq.RecoveryOptions(parts=True))

@@ -4,7 +4,7 @@ import numpy as np
 
 import sq_perception as sq
 from sq_perception.recordings import scene_export
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 
 frame = sample()
 found = sq.Recoverer().recover(frame.depth, frame.camera).recovered

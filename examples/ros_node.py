@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 
 rclpy.init()
 node = rclpy.create_node("camera")

@@ -9,7 +9,7 @@ from pathlib import Path
 import sq_perception as sq
 from sq_perception.learning.train import train
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.simulation.sample import sample
+from sq_perception.simulation.scenes import sample
 
 steps = int(sys.argv[1]) if len(sys.argv) > 1 else 1500
 config = TrainingConfig(

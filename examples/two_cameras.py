@@ -6,8 +6,7 @@ import numpy as np
 
 import sq_perception as sq
 from sq_perception.geometry import rotation
-from sq_perception.simulation.sample import sample
-from sq_perception.simulation.scenes import Scene
+from sq_perception.simulation.scenes import Scene, sample
 from sq_perception.tracking.views import View, fuse_views
 
 made = sample()

@@ -64,10 +64,8 @@ def text_of(found: SuperquadricArray | GraspArray, header: Any, summary: str) ->
 
 
 def from_response(response: Any) -> Answer:
-    """Return the answer of ``~/recover`` in a std_srvs/Trigger response.
-
-    Raises MessageError if it was no success, with its reason, or is of another service.
-    """
+    """Return the answer of ``~/recover`` in a std_srvs/Trigger response.  Raises MessageError if it was no success,
+    with its reason, or is of another service."""
     return Answer(*_parts(response, SuperquadricArray))
 
 
@@ -113,9 +111,7 @@ def superquadric_array(
     types: MessageTypes = find_type,
 ) -> Any:
     """Return the sq_msgs/SuperquadricArray of bodies (n,), covariances (n, 6, 6) of their poses, and their parts.
-
-    Raises ImportError where sq_msgs is not built.
-    """
+    Raises ImportError where sq_msgs is not built."""
     return types("sq_msgs/msg/SuperquadricArray")(
         header=header,
         superquadrics=_superquadrics(bodies, covariances, types),

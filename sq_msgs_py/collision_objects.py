@@ -49,14 +49,10 @@ class Scene:
     """
 
     def __init__(self) -> None:
-        self._known: dict[str, _Known] = {}
-        """By name."""
-        self._is_new = False
-        """Whether a planner listens that knows nothing."""
-        self._gone: dict[str, int] = {}
-        """How many repetitions remove a name once more, in the order in which they went."""
-        self._gone_again: frozenset[str] = frozenset()
-        """Those that the next frame removes once more."""
+        self._known: dict[str, _Known] = {}  # by name
+        self._is_new = False  # whether a planner listens that knows nothing
+        self._gone: dict[str, int] = {}  # how many repetitions remove a name once more, in the order in which they went
+        self._gone_again: frozenset[str] = frozenset()  # those that the next frame removes once more
         self._known_as = "", False
         self._header: Any = None
 
@@ -178,10 +174,8 @@ def collision_objects(
 
 
 def removals(names: Iterable[str], header: Any) -> list[CollisionObject]:
-    """Return one object to REMOVE for each name.
-
-    Raises ImportError without moveit_msgs; ValueError for an empty name: MoveIt would remove every object of the scene.
-    """
+    """Return one object to REMOVE for each name.  Raises ImportError without moveit_msgs; ValueError for an empty name:
+    MoveIt would remove every object of the scene."""
     from moveit_msgs.msg import CollisionObject
 
     names = sorted(names)

@@ -104,9 +104,7 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = find_type) -> P
 
 def from_message(kind: type[Rows], message: PointCloud2) -> Rows:
     """Return the rows of a message; columns that have a default are left out where their fields are not all there.
-
-    Raises MessageError as :func:`cloud_points`, or for columns that ``kind`` does not take.
-    """
+    Raises MessageError as :func:`cloud_points`, or for columns that ``kind`` does not take."""
     needed = {name for each in fields(kind) if each.default is MISSING for name in each.metadata["names"]}
     known = [name for name, _ in kind.FIELDS]
     points = cloud_points(message, known, [name for name in known if name in needed])
@@ -123,11 +121,8 @@ def from_message(kind: type[Rows], message: PointCloud2) -> Rows:
 
 
 def cloud_points(message: PointCloud2, known: Sequence[str], needed: Sequence[str]) -> np.ndarray:
-    """Return the points (n,) of a cloud as a structured array of those of the known fields that are there.
-
-    Raises MessageError if a field that is needed is missing, one has an unknown datatype, a count other than one or an
-    offset outside the point, or if the data is not as long as width, height and steps require.
-    """
+    """Return the points (n,) of a cloud as a structured array of those of the known fields that are there.  Raises
+    MessageError for a missing needed field, an unknown layout, or data of another length than it states."""
     order = ">" if message.is_bigendian else "<"
     present = {field.name: field for field in message.fields}
     missing = [name for name in needed if name not in present]

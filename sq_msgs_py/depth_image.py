@@ -63,18 +63,14 @@ def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYP
 
 def grey_from_message(message: Image) -> np.ndarray:
     """Return grey values, uint8 or uint16 (height, width), of a mono8 or mono16 image; a copy in native byte order.
-
-    Raises ImageError as :func:`pixels_from_message`.
-    """
+    Raises ImageError as :func:`pixels_from_message`."""
     pixels = pixels_from_message(message, GREY_ENCODINGS)
     return pixels.astype(pixels.dtype.newbyteorder("="))
 
 
 def labels_from_message(message: Image) -> np.ndarray:
-    """Return instance labels, int32 (height, width); 0 and everything below it is background.
-
-    Raises ImageError as :func:`pixels_from_message`; the encodings are those of ``LABEL_ENCODINGS``.
-    """
+    """Return instance labels, int32 (height, width); 0 and everything below it is background.  Raises ImageError as
+    :func:`pixels_from_message`; the encodings are those of ``LABEL_ENCODINGS``."""
     labels = pixels_from_message(message, LABEL_ENCODINGS).astype(np.int32)
     return np.maximum(labels, 0, out=labels)
 
@@ -99,10 +95,8 @@ def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", ty
 
 
 def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = find_type) -> Image:
-    """Return a mono8 or mono16 message of uint8 or uint16 grey values (height, width).
-
-    Raises ImageError for another dtype or not two dimensions.
-    """
+    """Return a mono8 or mono16 message of uint8 or uint16 grey values (height, width).  Raises ImageError for another
+    dtype or not two dimensions."""
     grey = np.asarray(grey)
     encoding = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16"}.get(grey.dtype)
     if encoding is None:
@@ -113,11 +107,8 @@ def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = find_ty
 def labels_to_message(
     labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = find_type
 ) -> Image:
-    """Return a label image message of integer labels (height, width).
-
-    Raises ImageError if the labels are not integers, do not fit the encoding, or the encoding is none of
-    ``LABEL_ENCODINGS``.
-    """
+    """Return a label image message of integer labels (height, width).  Raises ImageError if the labels are not
+    integers, do not fit the encoding, or the encoding is none of ``LABEL_ENCODINGS``."""
     labels = np.asarray(labels)
     if encoding not in LABEL_ENCODINGS:
         raise ImageError(f"encoding: expected {' or '.join(LABEL_ENCODINGS)}, got {encoding!r}")

@@ -34,10 +34,8 @@ FIELDS = columns.field_types("x y z qx qy qz qw opening width score id", unsigne
 
 @dataclass(frozen=True, eq=False)
 class GraspArray(Columns):
-    """n grasps, column by column; see the module for units and conventions.
-
-    Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
-    """
+    """n grasps, column by column; see the module for units and conventions.  Raises ValueError as
+    :class:`~sq_msgs_py.columns.Columns` does."""
 
     FIELDS = FIELDS
 
@@ -55,10 +53,8 @@ def to_message(grasps: GraspArray, header: Any, types: MessageTypes = find_type)
 
 
 def from_message(message: PointCloud2) -> GraspArray:
-    """Return the grasps of a message; fields are found by name, unknown ones are left aside.
-
-    Raises MessageError as for superquadrics.
-    """
+    """Return the grasps of a message; fields are found by name, unknown ones are left aside.  Raises MessageError as
+    for superquadrics."""
     return columns.from_message(GraspArray, message)
 
 

@@ -35,8 +35,7 @@ PALETTE = np.array(
 )
 """Colours that bodies take in turn, by id: those of sq_perception.geometry.mesh, where their choice is explained."""
 
-ALPHA = 0.7
-"""Opacity of surfaces unless given."""
+ALPHA = 0.7  # opacity of surfaces unless given
 
 
 def markers(

@@ -14,10 +14,8 @@ MessageTypes = Callable[[str], Callable[..., Any]]
 
 
 def find_type(name: str) -> Callable[..., Any]:
-    """Return the class of ``package/msg/Name`` from the message packages of a ROS installation.
-
-    Raises ImportError where that package is not installed.
-    """
+    """Return the class of ``package/msg/Name`` from the message packages of a ROS installation.  Raises ImportError
+    where that package is not installed."""
     package, folder, short = name.split("/")
     try:
         return resolve_name(f"{package}.{folder}:{short}")

@@ -52,9 +52,7 @@ def move(superquadrics: SuperquadricArray, rotation: np.ndarray, translation: np
 
 def plane_message(plane: np.ndarray, header: Any) -> PoseStamped:
     """Return a plane n.p + d = 0 (4,) as a pose: z is n, the origin is the point next to that of the header's frame.
-
-    The x axis is that of the header's frame laid into the plane, or its y axis where the plane is across x.
-    """
+    The x axis is that of the header's frame laid into the plane, or its y axis where the plane is across x."""
     from geometry_msgs.msg import PoseStamped
 
     normal, offset = np.asarray(plane[:3], dtype=float), float(plane[3])

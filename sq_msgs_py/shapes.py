@@ -85,10 +85,8 @@ def primitives(superquadrics: SuperquadricArray) -> list[Primitive]:
 
 
 def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
-    """Return a mesh of vertices (k, 3) and faces (m, 3) of vertex indices, outwards.
-
-    Raises ValueError if shapes or indices do not fit.
-    """
+    """Return a mesh of vertices (k, 3) and faces (m, 3) of vertex indices, outwards.  Raises ValueError if shapes or
+    indices do not fit."""
     from geometry_msgs.msg import Point
     from shape_msgs.msg import Mesh, MeshTriangle
 

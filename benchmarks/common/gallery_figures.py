@@ -17,9 +17,9 @@ from scipy.optimize import linear_sum_assignment
 
 from common.hull_columns import Columns
 from common.tabletop import Placed, Tabletop
-from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.plots import (
     colour,
+    draw_bodies_3d,
     draw_depth,
     draw_masks,
     draw_outlines,

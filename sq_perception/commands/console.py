@@ -66,10 +66,8 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
 
 
 def mark_negatives(arguments: Sequence[str]) -> list[str]:
-    """Prepare arguments with negative numbers, so that argparse takes none of them for an option.
-
-    It does so with -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores.
-    """
+    """Prepare arguments with negative numbers, so that argparse takes none of them for an option.  It does so with
+    -1e-3, -1., -1,2,3 and -inf.  Each gets a blank in front, which ``float`` ignores."""
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 
@@ -148,11 +146,8 @@ def replaced_input(
     inputs: Sequence[Path], files: Mapping[str, str | Path | None],
     folders: Mapping[str, tuple[Path | None, str]] | None = None,
 ) -> str:
-    """Complain if an output would replace an input; empty if none would.
-
-    ``files``: the files that are written, by the option that names each; None if it was not given.  ``folders``: the
-    folders that are written to, likewise, each with the suffix of the files there.
-    """
+    """Complain if an output would replace an input; empty if none would.  ``files`` and ``folders`` are by the option
+    that names each; None if it was not given; of a folder with the suffix of what is written there."""
     for name, file in files.items():
         path = None if file is None or str(file) == STANDARD_OUTPUT else Path(file)
         if path and path.exists() and any(given.exists() and path.samefile(given) for given in inputs):

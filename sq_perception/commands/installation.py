@@ -56,7 +56,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     from sq_perception.recovery import still_scene
     from sq_perception.recovery.recoverer import Recoverer
     from sq_perception.segmentation import segments
-    from sq_perception.simulation import scenes, view_rendering
+    from sq_perception.simulation import rendering, scenes
     from sq_perception.tracking import association
 
     batch = Superquadric.from_flat(np.array([[0.1, 0.2, 0.3, 0.5, 0.8, 0, 0, 1, 0, 0, 0, 1]]))
@@ -72,7 +72,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
 
     return [
         ("ray casting", lambda: raycast.render(body, camera)),
-        ("canonical views", lambda: view_rendering.render_views(batch, 16)),
+        ("canonical views", lambda: rendering.render_views(batch, 16)),
         ("overlap", lambda: metrics.volume_iou(batch, batch, 16)),
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),

@@ -104,7 +104,11 @@ class Outputs:
         self.results.append(entry)
         stem = output_file.free_name(_stem(entry), self._stems)
         if options.pictures:
-            _draw(options.pictures / f"{stem}.png", frame, recovery)
+            from sq_perception.evaluation.plots import save
+            from sq_perception.evaluation.recovery_figure import recovery_figure
+
+            title = console.replace_unprintable(frame.name)
+            save(recovery_figure(frame.depth, frame.camera, recovery, title), options.pictures / f"{stem}.png")
         if options.meshes:
             _write_mesh(options.meshes / f"{stem}.{options.mesh_format}", frame, recovery)
         if options.export:
@@ -121,10 +125,8 @@ class Outputs:
             self._lines.add(entry)
 
     def finish(self, whole: bool) -> Iterator[str]:
-        """Close growing files and write the documents; return one sentence per failure or other destination.
-
-        ``whole``: whether all frames were tried.
-        """
+        """Close growing files and write the documents, ``whole`` if all frames were tried; return a sentence per
+        failure or other destination."""
         if self._lines is not None:
             self._lines.close()
         for name, output in (("mcap", self._bag), ("html", self._page)):
@@ -179,14 +181,6 @@ def _bag(options: argparse.Namespace) -> ResultBag | None:
         return ResultBag(options.mcap, [] if images == ["none"] else images)
     except (ValueError, ImportError) as error:
         raise type(error)(f"--mcap: {error}") from error
-
-
-def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    """Draw the picture of a frame."""
-    from sq_perception.evaluation.plots import save
-    from sq_perception.evaluation.recovery_figure import recovery_figure
-
-    save(recovery_figure(frame.depth, frame.camera, recovery, console.replace_unprintable(frame.name)), path)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

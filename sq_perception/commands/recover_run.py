@@ -35,8 +35,10 @@ from sq_perception.recovery.recovery import edges_as_text, place_as_text
 from sq_perception.recovery.still_scene import StillScene
 
 
-def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
-    """Return the lines of all frames, then the reasons with their number of bodies."""
+def lines(
+    entries: Sequence[Mapping[str, Any]], verbose: bool, scene: Sequence[Mapping[str, Any]] = ()
+) -> Iterator[str]:
+    """Return the lines of all frames, the reasons with their number of bodies, and the lines of the whole scene."""
     reasons: Counter[tuple[str, str]] = Counter()
     for entry in entries:
         stamp = entry["stamp"]
@@ -62,10 +64,6 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
         yield f"{count} {status}: {reason}"
     if reasons:
         yield "what to do with them: docs/how_sure.md; -v shows more of each body"
-
-
-def scene_lines(scene: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Return the lines of the bodies of all frames together, in the world of their camera poses."""
     for body in scene:
         edges, place = edges_as_text(body["size"], body["sigma_size"], False), place_as_text(body["translation"], False)
         yield f"  {body['status']} {edges} at {place} id {body['id']}, in {body['seen']} frames"
@@ -105,11 +103,10 @@ def run(options: argparse.Namespace) -> int:
     except ValueError as error:
         return console.complain(str(error), console.USAGE)
     code = this.over_all_frames()
-    this.outputs.scene = this.scene()
     for problem in this.outputs.finish(this.is_whole):
         code = console.complain(problem, code or console.FAILURE)
     if console.STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
-        for line in (*lines(this.outputs.results, options.verbose), *scene_lines(this.outputs.scene)):
+        for line in lines(this.outputs.results, options.verbose, this.outputs.scene):
             print(line)
     if not options.quiet:
         console.complain(this.summary())
@@ -132,8 +129,7 @@ class RecoverRun:
             max_size=options.max_size, workspace=None if options.workspace is None else tuple(options.workspace),
             parts=options.parts,
         )
-        done = result_json.Recovered()
-        o = options
+        done, o = result_json.Recovered(), options
         limits = o.depth_scale, o.depth_min, o.depth_max, o.roi, o.masks, o.ignore_masks, o.depth_kind, o.frame
         source = o.camera_info, o.projection, o.topic, o.every, o.limit, o.distortion
         wanted = InputOptions(*source, Reading(*limits), o.camera_info_topic)
@@ -175,12 +171,10 @@ class RecoverRun:
             for text, files in self._said.items():
                 if len(files) > 1:
                     console.complain(f"{_count(len(files) - 1, 'more file')}: {text}")
+            if self._tracks:
+                self.outputs.scene = [result_json.scene_entry(track) for track in self._tracks.scene]
         self.is_whole = True
         return console.FAILURE if self._unreadable else console.SUCCESS
-
-    def scene(self) -> list[dict[str, Any]]:
-        """Return the bodies of all frames together, with camera poses."""
-        return [result_json.scene_entry(track) for track in self._tracks.scene] if self._tracks else []
 
     def summary(self) -> str:
         """Summarise the run in one line."""

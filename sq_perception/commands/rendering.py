@@ -39,9 +39,9 @@ def sample(arguments: Sequence[str]) -> int:
     import numpy as np
 
     from sq_perception.recovery.recovery import edges_as_text, place_as_text
-    from sq_perception.simulation import sample as simulation
+    from sq_perception.simulation import scenes
 
-    made = simulation.sample()
+    made = scenes.sample()
     with output_file.writing(output) as partial, partial.open("wb") as file:
         np.savez_compressed(file, depth=made.depth, K=made.camera.matrix)
     unknown = [np.nan] * 3

@@ -15,9 +15,6 @@ FITS: dict[Method, str] = {
     "symmetry": "surface fit, started by central symmetry alone",
     "classic": "Solina and Bajcsy's iterative fit to the points",
 }
-BODIES = 20_000
-"""Bodies for networks, as many as the thesis tested on."""
-FIT_BODIES = 2000
-"""The first of these for fits, which take some ten times as long."""
-DEFAULT_SEED = 2020
-"""Seed of the test set."""
+BODIES = 20_000  # bodies for networks, as many as the thesis tested on
+FIT_BODIES = 2000  # the first of these for fits, which take some ten times as long
+DEFAULT_SEED = 2020  # seed of the test set

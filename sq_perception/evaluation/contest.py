@@ -41,10 +41,8 @@ from sq_perception.recovery.recoverer import FrameRecovery, Method, Recoverer
 from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 
-CAMERA = unit_cube.camera()
-"""The orthographic camera of all images."""
-CHUNK = 200
-"""Images in memory at a time, 50 MB; changes no result."""
+CAMERA = unit_cube.camera()  # the orthographic camera of all images
+CHUNK = 200  # images in memory at a time, 50 MB; changes no result
 
 
 @dataclass(frozen=True)
@@ -80,11 +78,8 @@ class ThesisImages:
 
 
 class Answers(NamedTuple):
-    """What a contestant recovered from n images.
-
-    ``bodies`` (n, 12) are flat in the cube frame, NaN where nothing was recovered; ``milliseconds`` (n,) the time of
-    each image, NaN where it was not measured.
-    """
+    """What a contestant recovered from n images.  ``bodies`` (n, 12) are flat in the cube frame, NaN where nothing was
+    recovered; ``milliseconds`` (n,) the time of each image, NaN where it was not measured."""
 
     bodies: np.ndarray
     milliseconds: np.ndarray
@@ -113,11 +108,8 @@ class Contestant:
 
 
 def network(path: Path, name: str | None = None) -> Contestant:
-    """The network of a weights file.
-
-    Raises CheckpointError if the file is missing, damaged or of another kind, or its header names a loss that is not
-    known.
-    """
+    """The network of a weights file.  Raises CheckpointError if the file is missing, damaged or of another kind, or its
+    header names a loss that is not known."""
     model = inference.load(path)
     header = checkpoint.read_header(path)
     try:
@@ -195,13 +187,8 @@ def compare(
     contestants: Sequence[tuple[Contestant, int]], images: ThesisImages,
     advance: Callable[[str, int], None] | None = None,
 ) -> list[Outcome]:
-    """Have every contestant recover the first bodies of the test set.
-
-    contestants: Each with the number of its bodies, at most those of the test set.
-    advance: Called with a contestant's name and the number of bodies done.
-
-    Raises ValueError if a contestant is to recover no body, or more than there are.
-    """
+    """Have every contestant recover so many of the first bodies of the test set; ``advance`` is called with its name
+    and the number done.  Raises ValueError for no body, or more than there are."""
     for contestant, count in contestants:
         if not 1 <= count <= images.count:
             raise ValueError(f"{contestant.name}: expected 1 to {images.count} bodies, got {count}")

@@ -14,7 +14,6 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from sq_perception.evaluation import plots
-from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.contest import CAMERA, Outcome, ThesisImages
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
 from sq_perception.geometry.mesh import outline
@@ -103,7 +102,7 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
     axes[0].set_title(f"body {number}", loc="right", fontsize=8.5, color=plots.FAINT, pad=3)
     if is_recovered:
         true = outline(unit_cube.optical_from_cube(outcome.labels[number]), 64)
-        draw_bodies_3d(axes[2], [predicted], wires=list(true), elevation=22.0, azimuth=55.0, unit="", pixels=300)
+        plots.draw_bodies_3d(axes[2], [predicted], wires=list(true), elevation=22.0, azimuth=55.0, unit="", pixels=300)
     else:
         axes[2].set_axis_off()
         axes[2].text(0.5, 0.5, "no body", transform=axes[2].transAxes, ha="center", fontsize=9, color=plots.FAINT)

@@ -43,10 +43,8 @@ GOOD_IOU = 0.85
 
 @dataclass(frozen=True, eq=False)
 class FiguresOfMerit:
-    """Figures of n bodies, arrays (n,), ``delta_t`` (n, 3); fractions and radians, see the module.
-
-    ``milliseconds`` is the execution time of each image by itself, NaN where it was not measured.
-    """
+    """Figures of n bodies, arrays (n,), ``delta_t`` (n, 3); fractions and radians, see the module.  ``milliseconds`` is
+    the execution time of each image by itself, NaN where it was not measured."""
 
     iou: np.ndarray
     volume_iou: np.ndarray
@@ -96,11 +94,8 @@ class FiguresOfMerit:
         )
 
     def summary(self) -> dict[str, Any]:
-        """Means over a test set, as in the thesis' tables: JSON values by name.
-
-        Shares and relative errors are fractions, angles radians.  Numbers about parameters are over the ``recovered``
-        bodies, times over the ``timed`` ones; NaN where there is none.
-        """
+        """Means over a test set, as in the thesis' tables, JSON values by name: fractions and radians.  Parameters are
+        compared over the ``recovered`` bodies, times over the ``timed`` ones; NaN where there is none."""
         recovered = np.isfinite(self.delta_a)
         times = self.milliseconds[np.isfinite(self.milliseconds)]
         axes = self.axes_angle[recovered]

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from sq_perception.evaluation import plots
-from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.fitting.fit import Status
 from sq_perception.fitting.quality import undetermined
 from sq_perception.geometry.mesh import outline
@@ -24,11 +23,8 @@ from sq_perception.segmentation.segments import segment
 def demo_figure(
     depth: np.ndarray, camera: Camera, truth: Sequence[Superquadric], methods: Mapping[str, Sequence[Superquadric]]
 ) -> Figure:
-    """Draw a column for the image and its true bodies, and one a method: outlines above, bodies in space below.
-
-    depth: (height, width), metres, NaN for no reading.
-    truth, methods: Single bodies in the optical frame, those of the methods by title.
-    """
+    """Draw a column for the image (height, width), metres, and its true bodies, and one a method: outlines above,
+    bodies in space below.  Bodies are single ones in the optical frame."""
     columns = {"true bodies": truth, **methods}
     figure = plots.new_figure(5.0 * len(columns), 8.6)
     wires = [line for body in truth for line in outline(body, 64)]
@@ -45,7 +41,7 @@ def demo_figure(
             plots.draw_outlines(above, bodies, camera, width=1.8)
         plots.heading_of(above, title if k else "depth image", "" if k else f"{limits[0]:.2f} to {limits[1]:.2f} m")
         look = {"wires": wires} if k else {"colours": np.array([[0.62, 0.66, 0.7]])}
-        draw_bodies_3d(below, bodies, plane=plane, elevation=25, azimuth=40, **look)
+        plots.draw_bodies_3d(below, bodies, plane=plane, elevation=25, azimuth=40, **look)
         plots.heading_of(below, title, "wires: the true bodies" if k else "seen from the side")
     return figure
 
@@ -88,7 +84,9 @@ def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, 
     clouds = [points[(recovery.labels == body.label) & np.isfinite(depth)] for _, body in shown]
     for k, (elevation, azimuth, name) in enumerate(((24, 28, "From the camera's side"), (12, 90, "From the right"))):
         ax = figure.add_subplot(bottom[k])
-        draw_bodies_3d(ax, bodies, clouds, recovery.plane, shades, elevation=elevation, azimuth=azimuth, unit=unit)
+        plots.draw_bodies_3d(
+            ax, bodies, clouds, recovery.plane, shades, elevation=elevation, azimuth=azimuth, unit=unit
+        )
         plots.heading_of(ax, name, "")
     _draw_numbers(figure.add_subplot(bottom[2]), recovery, unit)
     return figure

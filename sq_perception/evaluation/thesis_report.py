@@ -21,8 +21,7 @@ from sq_perception.evaluation.contest import Outcome, ThesisImages
 
 Entry = Mapping[str, Any]
 """A contestant as results.json has it: name, loss (None for fits), and the summary of its figures."""
-NOTHING = "none given"
-"""What stands in the cells of a row of the thesis that no contestant answers."""
+NOTHING = "none given"  # what stands in the cells of a row of the thesis that no contestant answers
 NOT_IN_THESIS = "not in the thesis"
 
 
@@ -50,9 +49,6 @@ class _Row:
     loss: str
     thesis: Mapping[str, str]
 
-    def is_answered_by(self, result: Entry) -> bool:
-        return result["loss"] == self.loss if self.loss else not result["loss"] and result["name"] == "classic"
-
 
 _IOU, _TIME = "IoU", "Execution time [ms]"
 _ERRORS = ("ΔA", "ΔE", "ΔT")
@@ -65,7 +61,6 @@ _OCCUPANCY = _Row("supervised, L_OC", "occupancy", {
     _IOU: "94.62 ± 3.18 %", _TIME: "2.88 ± 0.92", "min": "52.71 %", "max": "99.24 %", "over 85 %": "99.06 %",
     "ΔA": "+0.14 %", "ΔE": "-0.36 %", "ΔT": "(+0.01 %, +0.01 %, -0.03 %)",
 })  # fmt: skip
-_OCCUPANCY_7_4 = replace(_OCCUPANCY, thesis={**_OCCUPANCY.thesis, _TIME: "2.82 ± 0.76"})
 _LEAST_SQUARES = _Row("unsupervised, L_LS", "least_squares", {
     _IOU: "74.82 ± 14.50 %", _TIME: "2.83 ± 0.22",
     "ΔA": "+13.69 %", "ΔE": "-19.27 %", "ΔT": "(+0.41 %, -0.05 %, -2.67 %)",
@@ -74,11 +69,7 @@ _RENDER = _Row("unsupervised, L_DR", "render", {
     _IOU: "85.64 ± 5.72 %", _TIME: "2.77 ± 0.16", "min": "44.18 %", "max": "95.25 %",
     "ΔA": "+8.22 %", "ΔE": "+4.01 %", "ΔT": "(+0.76 %, -0.63 %, -0.12 %)",
 })  # fmt: skip
-_FREE_SPACE = _Row("unsupervised, L_LS and free space", "least_squares_free", {})
-_DUAL_6_1 = _Row("Model 1, L_DUAL", "dual", {_IOU: "62.76 ± 11.34 %"})
-_OCCUPANCY_6_1 = replace(_OCCUPANCY, label="Model 2, L_OC")
-_ROTATION = _Row("rotation alone, L_OC(q)", "occupancy_rotation", {_IOU: "75.02 %"})
-_UNSUPERVISED = (_LEAST_SQUARES, _RENDER, _FREE_SPACE)
+_UNSUPERVISED = (_LEAST_SQUARES, _RENDER, _Row("unsupervised, L_LS and free space", "least_squares_free", {}))
 
 _COLUMNS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     _IOU: lambda s: spread(s["iou_mean"], s["iou_std"]),
@@ -111,9 +102,12 @@ def thesis_tables(results: Sequence[Entry]) -> list[Table]:
         "networks were measured on a GPU."
     )
     iou, times = (_IOU,), (_IOU, _TIME)
+    dual = _Row("Model 1, L_DUAL", "dual", {_IOU: "62.76 ± 11.34 %"}), replace(_OCCUPANCY, label="Model 2, L_OC")
+    rotation = _Row("rotation alone, L_OC(q)", "occupancy_rotation", {_IOU: "75.02 %"})
+    compared = replace(_OCCUPANCY, thesis={**_OCCUPANCY.thesis, _TIME: "2.82 ± 0.76"})
     return [
-        _table("Table 6.1: networks of all 12 parameters, supervised", (_DUAL_6_1, _OCCUPANCY_6_1), results, iou),
-        _table("Section 6.5.2: rotation alone, the other parameters given", (_ROTATION,), results, iou,
+        _table("Table 6.1: networks of all 12 parameters, supervised", dual, results, iou),
+        _table("Section 6.5.2: rotation alone, the other parameters given", (rotation,), results, iou,
                "A random rotation reaches about 58 % in the thesis."),
         _table("Figures 6.6 and 7.7 as numbers: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _SPREAD),
         _table("Table 6.2: errors of each parameter group", (_ITERATIVE, _OCCUPANCY), results, _ERRORS),
@@ -121,7 +115,7 @@ def thesis_tables(results: Sequence[Entry]) -> list[Table]:
         _table("Table 7.1: errors under L_LS", (_LEAST_SQUARES,), results, _ERRORS),
         _table("Table 7.2: unsupervised networks", _UNSUPERVISED, results, iou, own),
         _table("Table 7.3: errors of all", (_ITERATIVE, _OCCUPANCY, *_UNSUPERVISED), results, _ERRORS, own),
-        _table("Table 7.4: all in comparison", (_ITERATIVE, _OCCUPANCY_7_4, *_UNSUPERVISED), results, times,
+        _table("Table 7.4: all in comparison", (_ITERATIVE, compared, *_UNSUPERVISED), results, times,
                f"{time} {own}"),
     ]  # fmt: skip
 
@@ -165,7 +159,10 @@ def _table(title: str, rows: Sequence[_Row], results: Sequence[Entry], columns: 
         header += [name, f"{name}, thesis"]
     lines = []
     for row in rows:
-        answers: list[Entry | None] = [result for result in results if row.is_answered_by(result)]
+        if row.loss:
+            answers: list[Entry | None] = [result for result in results if result["loss"] == row.loss]
+        else:
+            answers = [result for result in results if not result["loss"] and result["name"] == "classic"]
         for result in answers or [None]:
             cells = [row.label, result["name"] if result else NOTHING]
             for name in columns:
@@ -196,12 +193,8 @@ _CAPTIONS = {
 def write(
     folder: Path, outcomes: Sequence[Outcome], images: ThesisImages, facts: dict[str, Any], failures: Sequence[str] = ()
 ) -> tuple[Path, list[Entry]]:
-    """Write report.md, results.json and the PNGs into an existing folder; returns report.md, and the contestants.
-
-    outcomes: At least one.
-    facts: JSON values about the run: those of :func:`provenance.facts`, the threads and the seed.
-    failures: Why some contestants are missing; shown at the top.
-    """
+    """Write report.md, results.json and the PNGs into a folder; returns report.md, and the contestants.  ``facts`` are
+    JSON values about the run, ``failures`` why contestants are missing."""
     entries: list[Entry] = []
     for outcome in outcomes:
         contestant, name = outcome.contestant, outcome.contestant.name

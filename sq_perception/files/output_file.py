@@ -18,10 +18,8 @@ from pathlib import Path
 
 
 class OutputFile:
-    """A result: write it to ``partial``, then :meth:`commit` or :meth:`discard` it, as a ``with`` block does.
-
-    Raises OSError if the result could not be written, or another program is writing it; nothing is changed then.
-    """
+    """A result: write it to ``partial``, then :meth:`commit` or :meth:`discard` it, as a ``with`` block does.  Raises
+    OSError if it could not be written, or another program is writing it; nothing is changed then."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)

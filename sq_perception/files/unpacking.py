@@ -15,12 +15,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-MOST_PIXELS = 2**25
-"""Pixels of an image, or numbers of an array: no depth camera has more."""
-MOST_BYTES = 16 * MOST_PIXELS
-"""Bytes of a file."""
-LONGEST_TEXT = 2**20
-"""Bytes of a YAML, JSON or text."""
+MOST_PIXELS = 2**25  # pixels of an image, or numbers of an array: no depth camera has more
+MOST_BYTES = 16 * MOST_PIXELS  # bytes of a file
+LONGEST_TEXT = 2**20  # bytes of a YAML, JSON or text
 _KINDS = ("PNG", "BMP", "TIFF")
 
 
@@ -60,9 +57,7 @@ def _check_count(array: np.ndarray, where: str = "") -> np.ndarray:
 
 def grey_image(path: Path, of_indices: bool = False) -> np.ndarray:
     """Read a grey PNG, BMP or TIFF (height, width), of any type of number; three equal channels are grey too.
-
-    ``of_indices`` takes a palette's indices in place of its colours: so label images are stored.
-    """
+    ``of_indices`` takes a palette's indices in place of its colours: so label images are stored."""
     from PIL import Image
 
     try:

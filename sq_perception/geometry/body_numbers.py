@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 LENGTHS = {"size": 3, "shape": 2, "translation": 3, "rotation": 4, "taper": 2}
-LARGEST_TAPER = 0.95
-"""Largest |k|: at 1 a body ends in a point, and the equation divides by 0 there."""
+LARGEST_TAPER = 0.95  # largest |k|: at 1 a body ends in a point, and the equation divides by 0 there
 LEAST_CONJUGATE = 1e-3
 """Least 2 - e, the exponent of the dual norm: 0 would be the maximum of an octahedron, from which this differs by at
 most 0.04 % for each norm, and without a division by 0."""
@@ -24,9 +23,7 @@ def floating(part: Any) -> np.ndarray:
 
 def one_body(parts: list[Any]) -> np.ndarray | None:
     """Check size, shape, translation, rotation, which becomes a unit quaternion, and taper of one NumPy body: (14,).
-
-    So few numbers are checked ten times as fast in Python.  None for anything else, numbers of no body included.
-    """
+    So few numbers are checked ten times as fast in Python.  None for anything else, numbers of no body included."""
     for part in parts:
         if not (type(part) is np.ndarray and part.ndim == 1 and part.dtype == np.float64):
             return None
@@ -47,10 +44,8 @@ def one_body(parts: list[Any]) -> np.ndarray | None:
 
 
 def check_turn(parts: list[np.ndarray]) -> np.ndarray:
-    """Check size, shape, translation, rotation and taper; return unit quaternions (..., 4).
-
-    Raises ValueError unless these are the numbers of bodies.
-    """
+    """Check size, shape, translation, rotation and taper; return unit quaternions (..., 4).  Raises ValueError unless
+    these are the numbers of bodies."""
     for name, part in zip(LENGTHS, parts, strict=True):
         if not np.isfinite(part).all():
             raise ValueError(f"{name}: expected finite numbers, got {part}")

@@ -28,10 +28,8 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 ROOT_OF_2 = math.sqrt(2.0)
 _BIAS = 2.0**52 + 1023.0
 """A number between 2^52 and 2^53 has its integer value in its lowest bits: adding this is a conversion."""
-_LOG2 = tuple(2 / math.log(2) / (2 * k + 1) for k in range(9))
-"""Coefficients of (log2 m - 1/2) / s, by powers of s^2."""
-_EXP2 = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))
-"""Coefficients of 2^r, by powers of r."""
+_LOG2 = tuple(2 / math.log(2) / (2 * k + 1) for k in range(9))  # coefficients of (log2 m - 1/2) / s, by powers of s^2
+_EXP2 = tuple(math.log(2) ** k / math.factorial(k) for k in range(13))  # coefficients of 2^r, by powers of r
 _OPTIONS: dict[str, Any] = {
     "nogil": True,
     "forceinline": True,

@@ -33,10 +33,8 @@ _beside: list[subprocess.Popen[bytes]] = []  # the process that compiles beside 
 
 
 def compile_beside() -> None:
-    """From now on start a second process as soon as a kernel has to be compiled, if there is a second core.
-
-    It compiles the later kernels of a recovery while this one is at those of the fit.
-    """
+    """From now on start a second process as soon as a kernel has to be compiled, if there is a second core.  It
+    compiles the later kernels of a recovery while this one is at those of the fit."""
     global _is_shared
     _is_shared = True
 

@@ -30,10 +30,8 @@ from sq_perception.geometry.body_numbers import LEAST_CONJUGATE
 from sq_perception.geometry.elementary import ROOT_OF_2, exp2, exp2_to_half, log2, log2_from_1_to_2
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-Triple: TypeAlias = tuple[float, float, float]
-"""A point, a direction or half sizes."""
-Form: TypeAlias = tuple[float, float, float, float, float, float, float]
-"""a1 a2 a3 e1 e2 k_x k_y."""
+Triple: TypeAlias = tuple[float, float, float]  # a point, a direction or half sizes
+Form: TypeAlias = tuple[float, float, float, float, float, float, float]  # a1 a2 a3 e1 e2 k_x k_y
 
 Support: TypeAlias = tuple[float, float, float, float, float, float, float, float]
 """A support function and its derivatives by n_x n_y n_z e1 e2 k_x k_y."""
@@ -52,11 +50,8 @@ def kernel(function: _F) -> _F:
 
 
 def parallel_kernel(function: _F) -> _F:
-    """Compile as :func:`kernel`, with ``numba.prange`` over all cores; for callers in Python.
-
-    Threads of numba may serve one call at a time, and end the process that calls them after a fork: calls wait for each
-    other, and a forked process computes on one thread.
-    """
+    """Compile as :func:`kernel`, with ``numba.prange`` over all cores; for callers in Python.  numba serves one call at
+    a time, and ends a process after a fork: calls wait for each other, and a fork computes on one thread."""
     alone = FunctionType(function.__code__, function.__globals__)
     alone.__qualname__ = f"{function.__qualname__}_alone"
     single, shared = _compiled(alone), _compiled(function, parallel=True)
@@ -84,12 +79,9 @@ def _compiled(function: _F, **more: bool) -> _F:
 
 @cache
 def _fingerprint(file: Path) -> str:
-    """A digest of a source file and all those of this package that it imports, directly or through others.
-
-    numba keeps machine code under the name of a function and checks the file that holds it, but not the files of the
-    kernels that were compiled into it: an update of this module alone would leave the old code at work elsewhere.  With
-    the digest in the name, code of other sources is never found.
-    """
+    """A digest of a source file and all those of this package that it imports.  numba checks the file that holds a
+    function, not those of kernels compiled into it: with the digest in the name, code of other sources is never
+    found."""
     known, ahead = {file}, [file]
     while ahead:
         new = _find_imports(ahead.pop()) - known
@@ -115,10 +107,8 @@ RAY_TOLERANCE, MAX_NEWTON_STEPS = 1e-9, 60
 """Tolerance of a ray's entry, as a share of its way through the bounding box, and of the gauge there; most steps."""
 _SINES = tuple(math.sin(math.pi * k / 6) for k in range(-3, 4))
 """Points of a tapered body's profile from which its support is sought, from pole to pole."""
-_SUPPORT_TOLERANCE = 1e-7
-"""Error of the sine at which that search ends: the support is off by its square."""
-_TINY = 1e-145
-"""A number whose square is still a normal one."""
+_SUPPORT_TOLERANCE = 1e-7  # error of the sine at which that search ends: the support is off by its square
+_TINY = 1e-145  # a number whose square is still a normal one
 
 
 @inline_kernel
@@ -217,10 +207,8 @@ def _by_sine(s: float, nx: float, ny: float, nz: float, form: Form) -> tuple[flo
 
 @kernel
 def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
-    """The sines (n,) of :func:`_by_sine` at the maximum for directions (3, n) in the frame of a tapered body.
-
-    The best of a few, then secants that never leave a bracket; loops over directions without a branch, for vector code.
-    """
+    """The sines (n,) of :func:`_by_sine` at the maximum for directions (3, n) in the frame of a tapered body.  The best
+    of a few, then secants that never leave a bracket; loops over directions without a branch, for vector code."""
     count = directions.shape[1]
     s, low, high, best = np.zeros(count), np.zeros(count), np.zeros(count), np.full(count, -np.inf)
     before, excess_before = np.zeros(count), np.zeros(count)
@@ -258,12 +246,8 @@ def profile_sines(directions: np.ndarray, form: Form) -> np.ndarray:
 def support_derivatives(
     nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float, k1: float, k2: float
 ) -> Support:
-    """max n.p over the body, for a direction of any length, and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2, h_k1,
-    h_k2.
-
-    The dual norm, see :meth:`Superquadric.support`.  The derivatives by n are the point of the body that is farthest;
-    that by a half size is dh/da1 = n_x h_nx / a1.
-    """
+    """max n.p over the body, for a direction of any length, see :meth:`Superquadric.support`: h, h_nx, h_ny, h_nz (the
+    point that is farthest), h_e1, h_e2, h_k1, h_k2.  That by a half size is dh/da1 = n_x h_nx / a1."""
     if k1 != 0.0 or k2 != 0.0:
         sines = profile_sines(np.array([[nx], [ny], [nz]]), (a1, a2, a3, e1, e2, k1, k2))
         return support_at(sines[0], nx, ny, nz, a1, a2, a3, e1, e2, k1, k2)

@@ -21,8 +21,7 @@ from sq_perception.geometry.superquadric import Superquadric
 if TYPE_CHECKING:
     import trimesh
 
-MARKER_RESOLUTION = 16
-"""Resolution of markers: coarse enough to be serialised at camera rate, about 35 kB per body."""
+MARKER_RESOLUTION = 16  # resolution of markers: coarse enough to be serialised at camera rate, about 35 kB per body
 
 COLOURS = np.array(
     [
@@ -42,8 +41,7 @@ Found by a random search for the greatest least difference (CIE 1976) of any two
 depth pictures, to normal, deuteranopic and protanopic eyes (Machado et al. 2009): 28.
 """
 
-FORMATS = ("glb", "ply", "stl", "obj")
-"""Suffixes of the files that :func:`export` writes."""
+FORMATS = ("glb", "ply", "stl", "obj")  # suffixes of the files that :func:`export` writes
 
 
 def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:

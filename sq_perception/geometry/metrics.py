@@ -17,10 +17,8 @@ from sq_perception.geometry.superquadric import Superquadric
 
 
 def thesis_iou(prediction: Superquadric, truth: Superquadric, resolution: int = 64) -> np.ndarray:
-    """Compute IoU on the thesis' grid: ``resolution``^3 points of the unit cube, ends included; cube frame.
-
-    What lies outside of the cube does not count, and two bodies that both lie outside have IoU 0.
-    """
+    """Compute IoU on the thesis' grid: ``resolution``^3 points of the unit cube, ends included; cube frame.  What lies
+    outside of the cube does not count, and two bodies that both lie outside have IoU 0."""
     count = _batch(prediction, truth)
     return _iou(prediction, truth, np.zeros((count, 3)), np.ones((count, 3)), resolution)
 

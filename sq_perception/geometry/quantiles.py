@@ -10,8 +10,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 
-MEDIAN_TO_SIGMA = 1.4826
-"""Standard deviation of normal numbers over the median of their absolute values."""
+MEDIAN_TO_SIGMA = 1.4826  # standard deviation of normal numbers over the median of their absolute values
 
 
 def quantile(numbers: np.ndarray, share: float) -> float:
@@ -40,11 +39,8 @@ def densest(ordered: np.ndarray, width: float) -> slice:
 
 @kernel
 def select(numbers: np.ndarray, rank: int) -> float:
-    """Return the float32 of (n,) >= 0 with ``rank`` others before it in ascending order.
-
-    Their bits, read as whole numbers, have the same order; a count of the upper halves finds the upper half of the
-    wanted one, and a second count the lower half.
-    """
+    """Return the float32 of (n,) >= 0 with ``rank`` others before it in ascending order.  Their bits, read as whole
+    numbers, have the same order: counts of the upper halves find that of the wanted one, then the lower half."""
     bits = numbers.view(np.uint32)
     left, high = rank, np.uint32(0)
     counts = np.zeros(1 << 16, np.int32)

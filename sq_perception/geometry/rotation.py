@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 from array_api_compat import array_namespace
 
-Array = Any
-"""A NumPy array or a torch tensor."""
+Array = Any  # a NumPy array or a torch tensor
 
 
 def normalize(quaternion: Array) -> Array:

@@ -46,12 +46,10 @@ from array_api_compat import array_namespace, is_torch_array
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, check_turn, floating, one_body
 
-Array = Any
-"""A NumPy array or a torch tensor."""
+Array = Any  # a NumPy array or a torch tensor
 
 NUMBERS = sum(LENGTHS.values())
-FLAT_LENGTH = NUMBERS - LENGTHS["taper"]
-"""Numbers of a body with and without its taper."""
+FLAT_LENGTH = NUMBERS - LENGTHS["taper"]  # numbers of a body with and without its taper
 _NEGLIGIBLE_RATIO = 1e-30
 _HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
 _QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
@@ -141,10 +139,8 @@ class Superquadric:
         return bool((self.taper != 0).any())
 
     def to_flat(self) -> Array:
-        """Return flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw.
-
-        Raises ValueError for bodies that taper, as this order has no place for it.
-        """
+        """Return flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw.  Raises ValueError for bodies that
+        taper, as this order has no place for it."""
         if self.is_tapered:
             raise ValueError("expected bodies without a taper; `to_numbers` has a place for it")
         return self.to_numbers()[..., :FLAT_LENGTH]
@@ -295,10 +291,8 @@ class Superquadric:
         return gauge, gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
 
     def parametric_points(self, eta: Array, omega: Array) -> Array:
-        """Return surface points (..., N, 3) in the parent frame at angles (N,) (thesis, equation 3.5).
-
-        ``eta`` in [-pi/2, pi/2] runs from pole to pole, ``omega`` in [-pi, pi) around z.
-        """
+        """Return surface points (..., N, 3) in the parent frame at angles (N,) (thesis, equation 3.5).  ``eta`` in
+        [-pi/2, pi/2] runs from pole to pole, ``omega`` in [-pi, pi) around z."""
         xp = array_namespace(self.size, eta)
         e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
         ring = _signed_power(xp.cos(eta), e1)
@@ -345,10 +339,7 @@ class Superquadric:
 
     def volume(self) -> np.ndarray:
         """Return the volume (...), m^3, of NumPy bodies: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2) (1 + k_x k_y
-        m).
-
-        m = B(3 e1/2, e1 + 1) / B(e1/2, e1 + 1) is the mean of (z/a3)^2 over the untapered body.
-        """
+        m).  m = B(3 e1/2, e1 + 1) / B(e1/2, e1 + 1) is the mean of (z/a3)^2 over the untapered body."""
         from scipy.special import beta  # here: a node that recovers does without
 
         size, shape = self.size, self.shape
@@ -383,10 +374,8 @@ class Superquadric:
     # The same body, other numbers
 
     def equivalent_forms(self) -> Superquadric:
-        """Return the 8 parameter vectors of the same body, batch shape (8, ...).
-
-        Half turns about x, y, z and none, then the same four after a quarter turn about z with a1 and a2 exchanged.
-        """
+        """Return the 8 parameter vectors of the same body, batch shape (8, ...).  Half turns about x, y, z and none,
+        then the same four after a quarter turn about z with a1 and a2 exchanged."""
         xp = array_namespace(self.size)
         turns = np.concatenate([_HALF_TURNS, quaternions.multiply(_QUARTER_TURN, _HALF_TURNS)])
         exchanged = xp.stack([self.size[..., k] for k in (1, 0, 2)], axis=-1)
@@ -470,10 +459,8 @@ def nested_norm_and_slopes(
 
 
 def p_norm(u: Array, v: Array, e: Array) -> Array:
-    """Return (u^(2/e) + v^(2/e))^(e/2) for u, v >= 0, elementwise, in ratio form.
-
-    Guarded twice, so that neither value nor gradient is anything but finite at u = 0, v = 0 or both.
-    """
+    """Return (u^(2/e) + v^(2/e))^(e/2) for u, v >= 0, elementwise, in ratio form.  Guarded twice, so that neither value
+    nor gradient is anything but finite at u = 0, v = 0 or both."""
     big, power = _ratio_form(u, v, e)
     xp = array_namespace(big)
     return big * xp.exp(0.5 * e * xp.log1p(power))

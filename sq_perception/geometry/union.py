@@ -82,8 +82,7 @@ def _icosphere() -> np.ndarray:
     return points
 
 
-DIRECTIONS = _icosphere()
-"""(42, 3) unit vectors, read only."""
+DIRECTIONS = _icosphere()  # (42, 3) unit vectors, read only
 
 
 def mirrored(axis: int) -> np.ndarray:

@@ -112,11 +112,8 @@ def approach_from_every_side(
 
 
 def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: float) -> Places:
-    """Find the places of each approach, at all depths and slides, where the pads meet the body squarely.
-
-    A body without any such place has all of its places.  ``steepest`` is the angle to the normals up to which a pad may
-    hold, radians.
-    """
+    """Find the places of each approach, at all depths and slides, where the pads meet the body squarely, up to
+    ``steepest`` radians from its normals; of a body without any, all of its places."""
     # Shares of the distance at which the finger's width leaves the body.
     slides = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
     shallow = np.minimum(0.012 - every.near - gripper.tip, every.deepest)  # so much finger beyond the near end

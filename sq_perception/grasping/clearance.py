@@ -159,10 +159,8 @@ def _gaps_to_cells(
     frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray,
     across: float,
 ) -> np.ndarray:
-    """Do as :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.
-
-    They are within ``across`` metres of their ``middles`` (3, c): cells that are out of reach are passed over.
-    """
+    """Do as :func:`gaps_to_points`, for points (3, j) sorted by cells, those of cell c from ``starts[c]`` on.  They are
+    within ``across`` metres of their ``middles`` (3, c): cells that are out of reach are passed over."""
     found = np.empty(len(frames))
     of_cells, of_points = np.empty(middles.shape[1]), np.empty(points.shape[1])
     for k in range(len(frames)):
@@ -186,10 +184,8 @@ def _gaps_to_cells(
 
 @inline_kernel
 def _distances(frame: np.ndarray, boxes: np.ndarray, places: np.ndarray, least: np.ndarray) -> None:
-    """Write the distances of places (3, j) to the nearest box (m, 6) of a gripper's frame to ``least``.
-
-    One loop over all places for each box, without a branch, so that it becomes vector code.
-    """
+    """Write the distances of places (3, j) to the nearest box (m, 6) of a gripper's frame to ``least``.  One loop over
+    all places for each box, without a branch, so that it becomes vector code."""
     least[:] = np.inf
     for box in range(len(boxes)):
         x, y, z, long, wide, high = boxes[box]

@@ -27,8 +27,7 @@ import numpy as np
 from sq_perception.geometry.kernels import gauge_derivatives, kernel, support_derivatives
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
-UNKNOWN = 0.1
-"""Default standard deviation, as a share of a half size."""
+UNKNOWN = 0.1  # default standard deviation, as a share of a half size
 
 
 def _directions() -> np.ndarray:
@@ -172,12 +171,8 @@ def _chords(
 
 @kernel
 def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, cosine: np.ndarray) -> None:
-    """Return where lines from at (3, k) along way (3, k) leave a body, in its frame, and the cosine to the normal.
-
-    They start where they leave the box around the body: g is convex along them, and Newton's steps from outside stay
-    outside, or come near to the surface from inside where a body tapers.  A step is one loop over all lines that has no
-    branch and few arrays, so that it becomes vector code.
-    """
+    """Return where lines from at (3, k) along way (3, k) leave a body, in its frame, and the cosine to the normal, by
+    Newton's method from the box around it; loops over all lines without a branch, for vector code."""
     a1, a2, a3, e1, e2, k1, k2 = body[0], body[1], body[2], body[3], body[4], body[12], body[13]
     half = a1 * (1.0 + abs(k1)), a2 * (1.0 + abs(k2)), a3
     x, y, z = at[0], at[1], at[2]

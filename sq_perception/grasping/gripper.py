@@ -99,10 +99,8 @@ class Gripper:
         return np.asarray(closed + openings[:, None, None] * (self.boxes(1.0) - closed))
 
     def faces_at(self, openings: np.ndarray) -> np.ndarray:
-        """Return places (k, 3, 9, 3) in the TCP's frame that a body must not reach, at many openings (k,).
-
-        On the pads of both fingers, from their middle to their end, and on the palm between them.
-        """
+        """Return places (k, 3, 9, 3) in the TCP's frame that a body must not reach, at many openings (k,).  On the pads
+        of both fingers, from their middle to their end, and on the palm between them."""
         x, share = np.repeat([-0.8, 0.0, 0.8], 3), np.tile([0.0, 0.5, 1.0], 3)
         boxes, places = self.boxes_at(openings), np.empty((len(openings), 3, 9, 3))
         places[:, :, :, 0] = 0.5 * self.finger_width * x

@@ -37,31 +37,18 @@ from sq_perception.fitting.fit import Fit
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import approaches, clearance
+from sq_perception.grasping import trials as margins
 from sq_perception.grasping.approaches import Closings
 from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import PANDA, Gripper
 from sq_perception.grasping.plan import Grasp, GraspPlan
 from sq_perception.grasping.rims import rim_grasps
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.grasping.trials import (
-    DENSITY,
-    LEAST_ENGAGED,
-    MARGINS,
-    PASSES,
-    POINT_SIGMA,
-    SIDE_SIGMA,
-    TABLE_SIGMA,
-    Trials,
-    log_passing,
-    log_phi,
-    weight,
-)
+from sq_perception.grasping.trials import Trials
 from sq_perception.imaging.camera import Camera
 
-FRICTION = 0.5
-"""Smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1."""
-PER_BODY = 8
-"""Maximum number of grasps returned per body."""
+FRICTION = 0.5  # smallest friction coefficient of rubber pads on cartons and plastics; the benchmark draws 0.5 to 1
+PER_BODY = 8  # maximum number of grasps returned per body
 PLACEMENT = 0.002
 """Standard deviation of the hand's position along each axis, metres: a careful calibration of camera and arm."""
 
@@ -136,7 +123,10 @@ def grasps(
     whole[np.setdiff1d(whole, np.flatnonzero(np.bincount(things)[things] == 1))] = -1
     trials = _trials(known, _loads(bodies, things, whole), closings, gripper, around, friction, placement)
     reasons[things[closings.owner]] = "no way for the fingers to come with the table and the palm in their way"
-    reasons[np.setdiff1d(things, things[~_are_behind(known, around.plane)])] = "behind the plane that bodies stand on"
+    if around.plane is not None:
+        top, _ = known.reaches(np.arange(len(bodies)), np.tile(around.plane[:3], (len(bodies), 1)))
+        is_behind = known.middle @ around.plane[:3] + top + around.plane[3] < 0
+        reasons[np.setdiff1d(things, things[~is_behind])] = "behind the plane that bodies stand on"
     checked = 200  # grasps per body whose distance to other bodies is computed
     trials = _narrow_sides(known, trials.first(checked), gripper, placement)
     trials = _keep_probable(trials, things, checked, reasons, "nothing holds")
@@ -153,18 +143,10 @@ def grasps(
 
 def _loads(bodies: Superquadric, things: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """Return the mass of each body's thing and its centre of mass, (n, 4): a grasp of a part lifts it all."""
-    mass = np.where(whole < 0, 0.0, DENSITY * np.asarray(bodies.volume()))
+    mass = np.where(whole < 0, 0.0, margins.DENSITY * np.asarray(bodies.volume()))
     of_thing = np.bincount(things, mass)
     moment = np.stack([np.bincount(things, mass * along) for along in bodies.translation.T], axis=1)
     return np.column_stack([of_thing, moment / of_thing[:, None]])[things]
-
-
-def _are_behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
-    """Return which bodies (n,) lie wholly behind the plane."""
-    if plane is None:
-        return np.zeros(len(bodies), dtype=bool)
-    top, _ = bodies.reaches(np.arange(len(bodies)), np.tile(plane[:3], (len(bodies), 1)))
-    return np.asarray(bodies.middle @ plane[:3] + top + plane[3] < 0)
 
 
 def _keep_probable(trials: Trials, things: np.ndarray, count: int, reasons: np.ndarray, why: str) -> Trials:
@@ -173,7 +155,7 @@ def _keep_probable(trials: Trials, things: np.ndarray, count: int, reasons: np.n
     without = trials.at(~np.isin(things[trials.owner], things[found.owner]))
     without = without._replace(owner=things[without.owner]).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
-        reasons[k] = f"{why}: {MARGINS[weakest]}"
+        reasons[k] = f"{why}: {margins.MARGINS[weakest]}"
     return found
 
 
@@ -204,16 +186,16 @@ def _trials(
 
     deep = np.hypot(ways.near_sigma, placement)
     room = 0.5 * ways.opening - ways.reach
-    logs = np.zeros((len(owner), len(MARGINS)))
-    passes = [log_passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))]
+    logs = np.zeros((len(owner), len(margins.MARGINS)))
+    passes = [margins.log_passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))]
     sides = np.stack(passes, axis=1)
     logs[:, 0] = sides[:, 0] + sides[:, 1]
-    logs[:, 1] = log_phi(u + gripper.tip + ways.near - LEAST_ENGAGED, deep)
-    logs[:, 2] = log_phi(gripper.palm - ways.near - u, deep)
-    logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)
-    logs[:, 4] = weight(loads[owner, 0], lever, 2 * friction * gripper.force)
+    logs[:, 1] = margins.log_phi(u + gripper.tip + ways.near - margins.LEAST_ENGAGED, deep)
+    logs[:, 2] = margins.log_phi(gripper.palm - ways.near - u, deep)
+    logs[:, 3] = np.where(np.isfinite(angle), margins.log_phi(cone - angle, doubt), -np.inf)
+    logs[:, 4] = margins.weight(loads[owner, 0], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
-        logs[:, 5] = log_phi(ways.height + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
+        logs[:, 5] = margins.log_phi(ways.height + offset @ around.plane[:3], np.hypot(margins.TABLE_SIGMA, placement))
     return Trials(owner, frames, ways.opening, 2 * ways.reach, logs, sides)
 
 
@@ -229,7 +211,7 @@ def _narrow_sides(bodies: KnownBodies, trials: Trials, gripper: Gripper, placeme
     for end, way in ((0, 1), (1, -1)):
         reach, sigma = bodies.reaches(owner, way * y)
         gap = 0.5 * trials.opening[rows] - np.fmin(reached[:, end], reach - way * aside)
-        trials.sides[rows, end] = log_passing(gap, sigma, placement)
+        trials.sides[rows, end] = margins.log_passing(gap, sigma, placement)
     trials.logs[rows, 0] = trials.sides[rows].sum(axis=1)
     return trials
 
@@ -244,13 +226,13 @@ def _add_surroundings(
     gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns, whole)
     near = np.flatnonzero(other >= 0)
     _, sigma = bodies.reaches(other[near], -way[near])
-    trials.logs[near, 6] = log_passing(gap[near], sigma, placement)
+    trials.logs[near, 6] = margins.log_passing(gap[near], sigma, placement)
     trials = trials.first(16)  # whose distance to points is computed
     boxes = gripper.boxes_at(trials.opening)
     gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
     if around.camera is not None:
         _weight_hidden(trials, gap, gripper, around, placement)
-    doubt = log_phi(gap + PASSES, np.hypot(POINT_SIGMA, placement))
+    doubt = margins.log_phi(gap + margins.PASSES, np.hypot(margins.POINT_SIGMA, placement))
     trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
     # Unseen space beside a body is occupied with a probability of 15 %.
     trials.logs[:, 8] = np.log1p(-0.15 * around.unseen(trials.frames, boxes[:, :2]))
@@ -261,7 +243,8 @@ def _weight_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Su
     """Weight sides and near ends by the share that the image does not show to be empty; points tell the rest."""
     turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
     hidden = around.hidden_share(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
-    shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(log_phi(gap + PASSES, np.hypot(SIDE_SIGMA, placement)))
+    passing = margins.log_phi(gap + margins.PASSES, np.hypot(margins.SIDE_SIGMA, placement))
+    shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(passing)
     trials.logs[:, 0] = np.log1p(hidden[:, :2] * np.expm1(trials.sides)).sum(axis=1) + np.log1p(shown)
     trials.logs[:, 2] = np.log1p(hidden[:, 2] * np.expm1(trials.logs[:, 2]))
 
@@ -275,5 +258,5 @@ def _to_grasps(trials: Trials) -> Iterator[Grasp]:
     for k in order:
         yield Grasp(
             int(trials.owner[k]), trials.frames[k, :, 3], turns[k], float(trials.opening[k]), float(trials.width[k]),
-            float(scores[k]), MARGINS[weakest[k]],
+            float(scores[k]), margins.MARGINS[weakest[k]],
         )

@@ -18,20 +18,10 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import clearance
+from sq_perception.grasping import trials as margins
 from sq_perception.grasping.gripper import Gripper
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.grasping.trials import (
-    CLEARANCE,
-    DENSITY,
-    LEAST_ENGAGED,
-    MARGINS,
-    PASSES,
-    POINT_SIGMA,
-    TABLE_SIGMA,
-    Trials,
-    log_phi,
-    weight,
-)
+from sq_perception.grasping.trials import Trials
 
 
 def rim_grasps(
@@ -45,23 +35,23 @@ def rim_grasps(
     width = np.array([rim[2] for rim in found]).repeat(len(insets))
     frames = np.array([rim[1] for rim in found]).reshape(-1, 3, 4).repeat(len(insets), axis=0)
     frames[:, :, 3] += (inset - gripper.tip)[:, None] * frames[:, :, 2]
-    sigma = np.hypot(POINT_SIGMA, placement)
-    opening = np.minimum(width + 2 * (CLEARANCE + 2 * sigma), gripper.opening)
+    sigma = np.hypot(margins.POINT_SIGMA, placement)
+    opening = np.minimum(width + 2 * (margins.CLEARANCE + 2 * sigma), gripper.opening)
     boxes = gripper.boxes_at(opening)
     middle = np.linalg.norm(frames[:, :, 3] - bodies.translation[owner], axis=1)
-    mass = 0.3 * DENSITY * bodies.volume()[owner]  # walls of 4 mm of a vessel 8 cm wide and 10 cm high
-    logs = np.zeros((len(owner), len(MARGINS)))
-    sides = np.repeat(log_phi(0.5 * (opening - width) + PASSES, sigma)[:, None], 2, axis=1)
+    mass = 0.3 * margins.DENSITY * bodies.volume()[owner]  # walls of 4 mm of a vessel 8 cm wide and 10 cm high
+    logs = np.zeros((len(owner), len(margins.MARGINS)))
+    sides = np.repeat(margins.log_phi(0.5 * (opening - width) + margins.PASSES, sigma)[:, None], 2, axis=1)
     logs[:, 0] = sides.sum(axis=1)
-    logs[:, 1] = log_phi(inset - LEAST_ENGAGED, sigma)
-    logs[:, 2] = log_phi(gripper.palm + gripper.tip - inset, sigma)
+    logs[:, 1] = margins.log_phi(inset - margins.LEAST_ENGAGED, sigma)
+    logs[:, 2] = margins.log_phi(gripper.palm + gripper.tip - inset, sigma)
     # In place of friction, as nothing tells how steep a wall is: nine in ten of the rims whose other margins
     # are sure hold in benchmarks/picking.py (not its reported scenes).
     logs[:, 3] = np.log(0.9)
-    logs[:, 4] = weight(mass, middle, 2 * friction * gripper.force, inset)
+    logs[:, 4] = margins.weight(mass, middle, 2 * friction * gripper.force, inset)
     if around.plane is not None:
         heights = clearance.heights_above(around.plane, frames, boxes)
-        logs[:, 5] = log_phi(heights, np.hypot(TABLE_SIGMA, placement))
+        logs[:, 5] = margins.log_phi(heights, np.hypot(margins.TABLE_SIGMA, placement))
     trials = Trials(owner, frames, opening, width, logs, sides)
     is_free = clearance.gaps_to_points(frames, boxes, around.points) > 0
     return trials.at(np.flatnonzero(is_free & _is_open(trials, boxes[:, 1], around)))
@@ -70,10 +60,8 @@ def rim_grasps(
 def _rims(
     body: Superquadric, owner: int, gripper: Gripper, around: Surroundings
 ) -> Iterator[tuple[int, np.ndarray, float]]:
-    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim.
-
-    A rim is 6 mm high, up to 12 mm thick and up to 15 mm outside of the body.
-    """
+    """Return owner, frame (3, 4) on the rim, y outwards, and wall thickness of each bearing that has a rim.  A rim is 6
+    mm high, up to 12 mm thick and up to 15 mm outside of the body."""
     assert around.plane is not None
     upwards = around.plane[:3] @ body.rotation_matrix
     axis = int(np.argmax(np.abs(upwards)))

@@ -53,9 +53,7 @@ class Surroundings:
     @classmethod
     def of_image(cls, depth: np.ndarray, camera: Camera, plane: np.ndarray | None) -> Surroundings:
         """Extract from a depth image its plane, points 8 mm above it thinned to a spacing of 5 mm, and what it hides.
-
-        ``depth`` is in metres, not positive or not finite where nothing was measured, its camera a pinhole one.
-        """
+        ``depth`` is in metres, not positive or not finite where nothing was measured, its camera a pinhole one."""
         depth = camera.readings(depth)
         z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
         if plane is None:

@@ -9,12 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-DENSITY = 500.0
-"""Density of objects, kg/m^3, between empty and full packages; the sigma of a mass is half of it."""
-CLEARANCE = 0.005
-"""Clearance on either side of the body and before the palm, metres."""
-LEAST_ENGAGED = 0.004
-"""Smallest length of finger beyond the near end, metres."""
+DENSITY = 500.0  # density of objects, kg/m^3, between empty and full packages; the sigma of a mass is half of it
+CLEARANCE = 0.005  # clearance on either side of the body and before the palm, metres
+LEAST_ENGAGED = 0.004  # smallest length of finger beyond the near end, metres
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
 """Standard deviation, metres, to which thinned points tell where an object's side is that the image shows a finger to
@@ -26,10 +23,8 @@ MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "othe
 
 
 class Trials(NamedTuple):
-    """k candidate grasps and the logarithm of the probability of each margin so far.
-
-    ``sides`` (k, 2) are those of the two sides that the fingers pass, whose sum is the margin of the opening.
-    """
+    """k candidate grasps and the logarithm of the probability of each margin so far.  ``sides`` (k, 2) are those of the
+    two sides that the fingers pass, whose sum is the margin of the opening."""
 
     owner: np.ndarray
     frames: np.ndarray
@@ -78,10 +73,7 @@ def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
 
 
 def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = 0.006) -> np.ndarray:
-    """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line.
-
-    As a force, against gravity and a lift with 2 m/s^2, and as a torque that the friction holds by its mean ``arm``,
-    by default that of a pad of some 18 mm.
-    """
+    """Return log P (k,) that the friction ``force`` of both pads lifts a mass ``lever`` beside the closing line, with 2
+    m/s^2 and by the torque that it holds with its mean ``arm``, by default that of a pad of some 18 mm."""
     load = np.maximum(1.0, lever / arm) * (9.81 + 2.0) * mass / force
     return log_phi(1 / np.maximum(load, 1e-9) - 1, 0.5)

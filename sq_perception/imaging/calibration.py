@@ -57,17 +57,8 @@ class Calibration:
 
     @classmethod
     def of(cls, info: Any, name: str = "", distortion: Treatment = "auto") -> Calibration:
-        """The calibration of a camera_info.
-
-        Quick: tables are computed for the first image, and calibrations that are equal share them.
-
-        info: Anything with the fields of sensor_msgs/CameraInfo.
-        name: Topic of the images, as it is after remapping, or the path of a file.
-        distortion: See the module.
-
-        Raises ValueError if the camera_info is not usable; the message gives the reason and the setting that might
-        help.
-        """
+        """The calibration of a camera_info, for images of a topic or file of this ``name``; quick, as tables are made
+        for the first image.  Raises ValueError with the reason and the setting that might help."""
         if distortion not in get_args(Treatment):
             raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
         note = ""
@@ -95,10 +86,8 @@ class Calibration:
         return sent.width, sent.height
 
     def rectify(self, depth: np.ndarray) -> np.ndarray:
-        """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.
-
-        Raises ValueError if the image has not the size of ``size``; the message names the likely reason.
-        """
+        """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.  Raises
+        ValueError if the image has not the size of ``size``; the message names the likely reason."""
         self.check(depth)
         return depth if self.rectification is None else self.rectification.there.depth(depth)
 
@@ -109,9 +98,7 @@ class Calibration:
 
     def as_sent(self, depth: np.ndarray) -> np.ndarray:
         """A depth image of ``camera`` with the pixels of the images as they are sent; metres, NaN or inf for nothing.
-
-        Raises ValueError if the image has not the size of ``camera``.
-        """
+        Raises ValueError if the image has not the size of ``camera``."""
         self.camera.check_image(depth)
         return depth if self.rectification is None else self.rectification.back.depth(depth)
 

@@ -135,10 +135,8 @@ class Camera:
         return Camera(width, height, self.fx, self.fy, self.cx - left, self.cy - top, self.projection)
 
     def readings(self, depth: np.ndarray) -> np.ndarray:
-        """A depth image as a plain array, NaN where it is masked.
-
-        Raises ValueError unless it is a float image (height, width) of this camera's size: whole numbers are no metres.
-        """
+        """A depth image as a plain array, NaN where it is masked.  Raises ValueError unless it is a float image
+        (height, width) of this camera's size: whole numbers are no metres."""
         image = np.asanyarray(depth)
         if image.ndim != 2 or image.dtype.kind != "f":
             given = f"{image.dtype} {image.shape}"

@@ -34,18 +34,13 @@ from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.raycast import point_at
 
-MARGIN = 1.06
-"""Side of the cube over the side of what is seen in it."""
+MARGIN = 1.06  # side of the cube over the side of what is seen in it
 
-HIDDEN = -0.5
-"""Value of a pixel at which the object may go on unseen, in views that distinguish this from background."""
-FLUSH = -0.25
-"""Value of a pixel beside the object that is as near as its edge, in views that show steps."""
-COVERED = -1.5
-"""Value of a pixel of the object's mask at which nothing was measured, in views that show steps."""
+HIDDEN = -0.5  # value of a pixel at which the object may go on unseen, in views that distinguish this from background
+FLUSH = -0.25  # value of a pixel beside the object that is as near as its edge, in views that show steps
+COVERED = -1.5  # value of a pixel of the object's mask at which nothing was measured, in views that show steps
 
-NEAREST = 0.5 * (1 + 1 / MARGIN)
-"""z0: the value of the object's nearest point."""
+NEAREST = 0.5 * (1 + 1 / MARGIN)  # z0: the value of the object's nearest point
 OUTLIERS_PER_END = 1 / 500
 """Share of an object's depths, the nearest and the farthest, that do not count for its extent."""
 _NEARER = 0.04  # share of the view's side by which something nearer than the object hides what is behind it
@@ -247,9 +242,7 @@ def _rotate(
     depth: np.ndarray, mask: np.ndarray, unread: float, lens: Lens, matrix: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere; least, largest turned (x, y); least z.
-
-    Unless ``unread`` is NaN, the (x, y) of other pixels of the mask, as deep as that, are among those.
-    """
+    Unless ``unread`` is NaN, the (x, y) of other pixels of the mask, as deep as that, are among those."""
     image = np.full(depth.shape, np.float32(np.nan))
     low, high, closest = np.full(2, np.inf), np.full(2, -np.inf), np.inf
     for v in range(depth.shape[0]):
@@ -271,11 +264,8 @@ def _nearer(
     depth: np.ndarray, mask: np.ndarray, filled: np.ndarray, lost: np.ndarray, lens: Lens, matrix: np.ndarray,
     plane: np.ndarray, tolerance: float,
 ) -> np.ndarray:
-    """How much nearer than the object, metres, whose depth there is in ``filled``, each reading beside it is.
-
-    -inf at pixels of the object and of the plane.  Where nothing was measured: +inf within the mask and NaN beyond it
-    at the pixels set in ``lost``, -inf at the others.
-    """
+    """How much nearer than the object, whose depth is in ``filled``, each reading beside it is, metres; -inf on object
+    and plane.  Without a reading +inf within the mask and NaN beyond it where set in ``lost``, else -inf."""
     nearer = np.full(depth.shape, np.float32(-np.inf))
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):

@@ -46,23 +46,15 @@ def encoding(image_format: str) -> str | None:
 
 
 def size(image_format: str, data: bytes | np.ndarray) -> tuple[int, int]:
-    """Width and height of a packed image, without unpacking it.
-
-    Raises ValueError as :func:`decode`.
-    """
+    """Width and height of a packed image, without unpacking it.  Raises ValueError as :func:`decode`."""
     _known(image_format)
     head = bytes(data[: _HEADER.size + _IMAGE_HEADER.size])
     return _rvl_size(head) if _is_rvl(image_format) else _png_size(head)
 
 
 def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
-    """The numbers (height, width) of the image before it was packed: uint16 of 16UC1, 0 for nothing, or float32 metres
-    of 32FC1, NaN for nothing.
-
-    image_format, data: ``format`` and ``data`` of the sensor_msgs/CompressedImage.
-
-    Raises ValueError for another format, or data that is no such image; the message names what was expected.
-    """
+    """The numbers (height, width) before they were packed, by ``format`` and ``data`` of a CompressedImage: uint16 of
+    16UC1, 0 for nothing, or float32 metres of 32FC1, NaN for nothing.  Raises ValueError for anything else."""
     packed = _known(image_format)
     message = bytes(data)
     if _is_rvl(image_format):
@@ -128,10 +120,7 @@ def _grey(message: bytes) -> np.ndarray:
 
 
 def decode_rvl(data: bytes, width: int, height: int) -> np.ndarray:
-    """The pixels, uint16 (height, width), of RVL.
-
-    Raises ValueError if the data does not hold that many pixels.
-    """
+    """The pixels, uint16 (height, width), of RVL.  Raises ValueError if the data does not hold that many pixels."""
     count = width * height
     # 17 bits of a difference are 6 nibbles, and a run of one pixel has 2 more.
     if len(data) > 4 * count + 64:

@@ -23,8 +23,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-STEP = 0.015
-"""Share of the depth by which neighbouring pixels of one surface differ at most."""
+STEP = 0.015  # share of the depth by which neighbouring pixels of one surface differ at most
 
 
 def edges(filled: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:
@@ -90,9 +89,7 @@ def shown_step(footprint: float) -> float:
 @kernel
 def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
     """The mask (height, width) without the pieces that are of something else; a step is more than ``jump`` metres.
-
-    Pixels without depth, NaN, belong to no piece and stay.
-    """
+    Pixels without depth, NaN, belong to no piece and stay."""
     # Share of a piece's pixels, or of the border pixels of one across a step, that lie beside pixels of its depth
     # outside the mask, from which on it is a fringe.
     fringe = 1 / 3

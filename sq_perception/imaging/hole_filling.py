@@ -19,9 +19,7 @@ def fill(
     depth: np.ndarray, labels: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
     """A perforated image with its gaps closed, labels that go with the readings, and the gaps, bool (height, width).
-
-    Any other image is returned as it is, with None for the gaps.
-    """
+    Any other image is returned as it is, with None for the gaps."""
     measured = np.isfinite(depth)
     if measured.all():
         return depth, labels, None

@@ -20,8 +20,7 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 
-STEEPEST = 10.0
-"""Tangent of the incidence, of 84 degrees, beyond which neighbouring pixels show two surfaces: a jump."""
+STEEPEST = 10.0  # tangent of the incidence, of 84 degrees, beyond which neighbouring pixels show two surfaces: a jump
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,10 +36,8 @@ class InverseDepth:
 
     @classmethod
     def of(cls, depth: np.ndarray, camera: Camera) -> InverseDepth:
-        """The inverse of a depth image (height, width), metres, positive; +inf or NaN where nothing is seen.
-
-        Raises ValueError if the camera is no pinhole, or a depth is not positive.
-        """
+        """The inverse of a depth image (height, width), metres, positive; +inf or NaN where nothing is seen.  Raises
+        ValueError if the camera is no pinhole, or a depth is not positive."""
         if not camera.is_pinhole:
             raise ValueError(f"camera: expected a pinhole camera, got an {camera.projection} one")
         with np.errstate(divide="ignore"):

@@ -37,20 +37,14 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.inverse_depth import STEEPEST
 
-LARGEST_SIDE = 2**15 - 2
-"""Largest side of an image that OpenCV can look up, pixels."""
+LARGEST_SIDE = 2**15 - 2  # largest side of an image that OpenCV can look up, pixels
 _OUTSIDE = -9.0  # a column and row that no image has
 
 
 @dataclass(frozen=True)
 class Rectification:
-    """From a raw camera to the pinhole camera in its place; :func:`rectification` gives one whose tables are kept.
-
-    raw: Size and intrinsics (K) of the raw images; pinhole.
-
-    Raises ValueError if the camera is no pinhole, its images are too large, or the distortion cannot be undone in the
-    middle of it.
-    """
+    """From a raw pinhole camera (K) to the one in its place; :func:`rectification` keeps their tables.  Raises
+    ValueError if the images are too large, or the distortion cannot be undone in the middle."""
 
     raw: Camera
     distortion: Distortion
@@ -115,9 +109,7 @@ class Lookup:
 
     def depth(self, image: np.ndarray) -> np.ndarray:
         """The depth image, float32 in metres, from one of the source: positive, NaN or +inf where there is nothing.
-
-        The result is NaN where there is no depth, also where the source does not see.
-        """
+        The result is NaN where there is no depth, also where the source does not see."""
         image = np.ascontiguousarray(image, dtype=np.float32)
         nearest = self._nearest(image, np.nan)
         # Warnings for pixels without depth only.

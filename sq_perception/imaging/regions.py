@@ -11,9 +11,7 @@ from sq_perception.imaging.camera import Camera
 
 def nearest(wanted: np.ndarray) -> np.ndarray:
     """For each pixel (height, width), the index into the flat image of the nearest pixel that is set in ``wanted``.
-
-    ``wanted`` is bool (height, width), with at least one pixel set.
-    """
+    ``wanted`` is bool (height, width), with at least one pixel set."""
     away = (~wanted).view(np.uint8)
     _, number = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     index = np.zeros(int(number.max()) + 1, np.int64)
@@ -30,10 +28,8 @@ def convex_hull(mask: np.ndarray) -> np.ndarray:
 
 
 def extents(labels: np.ndarray) -> np.ndarray:
-    """Size and bounding box of each label, int64 (count + 1, 5); all 0 for label 0 and for labels without pixels.
-
-    In this order: number of pixels, first row, last row + 1, first column, last column + 1.
-    """
+    """Number of pixels, first row, last row + 1, first column and last column + 1 of each label, int64 (count + 1, 5);
+    all 0 for label 0 and for labels without pixels."""
     labels = np.ascontiguousarray(labels, dtype=np.int32)
     return np.asarray(_extents(labels, int(labels.max(initial=0))))
 
@@ -66,9 +62,7 @@ def box(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 def fills(mask_box: tuple[int, int, int, int], measured: np.ndarray) -> bool:
     """Whether the box of a mask, as by :func:`box`, runs out of all readings, bool (height, width), on opposite sides.
-
-    Readings need not reach the border of the image, as those of a rectified one and of a stereo camera do not.
-    """
+    Readings need not reach the border of the image, as those of a rectified one and of a stereo camera do not."""
     # Share of a side of an image: the most of it that a band without readings takes along a border; beyond more there
     # is nothing to measure. That of a D435 takes so much of what is 0.25 m away. Chosen.
     band = 0.1

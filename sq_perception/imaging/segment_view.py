@@ -75,13 +75,8 @@ def from_segment(
     depth: np.ndarray, labels: np.ndarray, label: int, window: tuple[slice, slice], camera: Camera,
     plane: np.ndarray | None,
 ) -> SegmentView:
-    """The view of a segment with at least one reading.
-
-    depth: float (height, width), metres, not finite or 0 where nothing was measured.
-    labels: int32 (height, width), segments, 0 for background.
-    label, window: The segment, and the least window of the image that holds it.
-    plane: (4,) or None, support plane, height above it = n.p + d.
-    """
+    """The view of a segment with at least one reading, in an image of metres, not finite or 0 where nothing was
+    measured; ``window`` is the least one around it, ``plane`` (4,) or None its support, height = n.p + d."""
     down, across = window
     tall, wide = down.stop - down.start, across.stop - across.start
     focal = math.sqrt(camera.fx * camera.fy)
@@ -145,11 +140,8 @@ def _show(
     image: np.ndarray, depth: np.ndarray, labels: np.ndarray, label: int, rows: np.ndarray, columns: np.ndarray,
     lens: Lens, plane: np.ndarray, middle: float, scale: float,
 ) -> None:
-    """Write what the cells of an empty view show.
-
-    ``rows`` and ``columns`` (POINTS PIXELS,) are the pixels under the points of the cells, ``middle`` and ``scale`` the
-    module's m and s; a ``plane`` that is not known is 0.
-    """
+    """Write what the cells of an empty view show.  ``rows`` and ``columns`` (POINTS PIXELS,) are the pixels under the
+    points of the cells, ``middle`` and ``scale`` the module's m and s; a ``plane`` that is not known is 0."""
     fx, fy, cx, cy, _ = lens
     height, width = depth.shape
     least, most = -0.3, 1.5

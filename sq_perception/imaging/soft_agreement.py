@@ -18,8 +18,7 @@ import numpy as np
 from sq_perception.geometry.elementary import exp2
 from sq_perception.geometry.kernels import box_interval, gauge, kernel
 
-THESIS_SHARPNESS = 117.3
-"""Sharpness s of the thesis' renderer."""
+THESIS_SHARPNESS = 117.3  # sharpness s of the thesis' renderer
 THESIS_TAU = 4.82
 _NEGLIGIBLE = 30.0
 _PER_E = math.log2(math.e)  # the logarithm of e to base 2

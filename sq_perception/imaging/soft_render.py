@@ -77,10 +77,8 @@ def _check_positive(name: str, value: float) -> None:
 def of_view(
     view: torch.Tensor, stride: int = 1, row: int = 0, column: int = 0, framing: str = "cropped"
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lines (r, 2) of every ``stride``-th pixel of views (n, p, p), and the views' values (n, r) there.
-
-    Column k of a cropped canonical view is seen along x = (k + 1/2) / p; of a full frame, x = k / (p - 1).
-    """
+    """Lines (r, 2) of every ``stride``-th pixel of views (n, p, p), and the views' values (n, r) there.  Column k of a
+    cropped canonical view is seen along x = (k + 1/2) / p; of a full frame, x = k / (p - 1)."""
     pixels = view.shape[-1]
     columns = torch.arange(pixels, dtype=torch.float64, device=view.device)
     centres = (columns / (pixels - 1) if framing == "full" else (columns + 0.5) / pixels).to(view.dtype)
@@ -100,10 +98,8 @@ def nearest_approach(bodies: Superquadric, lines: torch.Tensor) -> torch.Tensor:
 
 
 def free_space_excess(bodies: Superquadric, lines: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """How deep each line runs inside the body before it ends: max(0, 1 - min g), (n, r), differentiable.
-
-    ``depth`` (n, r) is z where the line met a surface, and 0 or less where it met none and goes on for ever.
-    """
+    """How deep each line runs inside the body before it ends: max(0, 1 - min g), (n, r), differentiable.  ``depth`` (n,
+    r) is z where the line met a surface, and 0 or less where it met none and goes on for ever."""
     end = torch.where(depth > 0, depth, torch.full_like(depth, -math.inf))
     return (1 - gauge(bodies, lines, torch.maximum(nearest_approach(bodies, lines), end))).clamp(min=0)
 

@@ -37,8 +37,7 @@ def optical_from_cube(body: Superquadric) -> Superquadric:
     return body.transformed(_HALF_TURN_ABOUT_X, _SHIFT)
 
 
-cube_from_optical = optical_from_cube
-"""The inverse; the same map, as a half turn is its own inverse."""
+cube_from_optical = optical_from_cube  # the inverse; the same map, as a half turn is its own inverse
 
 
 def depth_from_grey(image: np.ndarray) -> np.ndarray:

@@ -40,8 +40,7 @@ FORMAT, THING_FORMAT, MASK_FORMAT = "sq_perception.regressor", "sq_perception.th
 _FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT, MaskConfig: MASK_FORMAT}
 Config = TypeVar("Config", RegressorConfig, ThingConfig, MaskConfig)
 VERSION = "1"
-DEFAULT = "robust"
-"""Name of the weights that predict a body where none are named."""
+DEFAULT = "robust"  # name of the weights that predict a body where none are named
 _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things", MaskConfig: "masks"}
 """Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
@@ -117,13 +116,9 @@ def _module(kind: Any, config: RegressorConfig | ThingConfig | MaskConfig, weigh
 
 
 def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, dict[str, np.ndarray]]:
-    """The form of a network of a kind and its weights by name, in single precision.
-
-    The path is as :func:`resolve` takes it, None for the weights of this kind that are used where none are named.
-
-    Raises CheckpointError if the file is missing, no safetensors file, of another format or version, or does not fit
-    its own config.
-    """
+    """The form of a network and its float32 weights by name; the path is as :func:`resolve` takes it, None for the
+    shipped ones of this kind.  Raises CheckpointError if the file is missing, of another kind, or does not fit its
+    config."""
     path = resolve(_SHIPPED[kind] if path is None else path)
     config = _parse_config(path, read_header(path), kind)
     try:

@@ -6,7 +6,7 @@ images.
 Disturbances are what cameras, masks and neighbours do to a view.  They are relative to its side, so that one
 description serves objects of any size:
 
-    occluder    hides a share of the body, uniform up to 0.4 (see view_rendering.Occluder)
+    occluder    hides a share of the body, uniform up to 0.4 (see rendering.Occluder)
     noise       sigma log-uniform from 1/2000 to 3/100 of the side; a part of it is common to blocks of pixels,
                 as where one measurement covers several pixels of the view or a matching window smooths
     steps       quantised depth, 1/400 to 1/25 of the side
@@ -26,13 +26,12 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.learning.choices import Framing
 from sq_perception.learning.inference import move_bodies, move_images
+from sq_perception.simulation.rendering import Occluder, render_views
 from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
-from sq_perception.simulation.view_rendering import Occluder, render_views
 
 GREY_LEVELS = 255.0
 _SMALLEST = 1 / GREY_LEVELS  # least depth of a view that is not background
-POOL = 4096
-"""Views of a pool: a gigabyte of those of the thesis' size."""
+POOL = 4096  # views of a pool: a gigabyte of those of the thesis' size
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,7 @@ class Disturbance:
         return any_occluder(share, rng)
 
     def framing(self, count: int, rng: np.random.Generator) -> np.ndarray | None:
-        """Errors (count, 4) of the framing, see :func:`view_rendering.render_views`; None where nothing is noisy."""
+        """Errors (count, 4) of the framing, see :func:`rendering.render_views`; None where nothing is noisy."""
         if self.noisy_share == 0:
             return None
         deviations = np.array([0.012, 0.012, 0.012, 0.02])
@@ -105,10 +104,8 @@ def wide_bodies(count: int, rng: np.random.Generator) -> Superquadric:
 def draw_views(
     count: int, rng: np.random.Generator, source: ViewSource | None = None, occluder: Occluder | None = None
 ) -> tuple[np.ndarray, Superquadric]:
-    """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.
-
-    Noise, holes and edges are left to :meth:`Disturbance.apply`, which changes a view anew each time it is used.
-    """
+    """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.  Noise, holes and
+    edges are left to :meth:`Disturbance.apply`, which changes a view anew each time it is used."""
     source = source or ViewSource()
     pinhole_share, disturbance = source.pinhole_share, source.disturbance
     bodies = thesis_bodies(count, rng)
@@ -139,11 +136,8 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
 
 
 class ViewPool:
-    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions and noise.
-
-    Rendering costs as much as a training step: each batch renders only ``batch / reuse`` new views, which replace the
-    oldest of the pool.
-    """
+    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions and noise.  Each
+    batch renders only ``batch / reuse`` new ones, in place of the oldest: that costs as much as a training step."""
 
     def __init__(
         self, rng: np.random.Generator, source: ViewSource | None = None, capacity: int = POOL, reuse: int = 4

@@ -54,10 +54,8 @@ class Predictor:
     predict_once: Callable[[np.ndarray], Superquadric]  # bodies (n,) of checked views (n, p, p), in one position
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        """NumPy superquadrics (n,) of NumPy views (n, p, p).
-
-        Raises ValueError if the views are not (n, p, p) with p = ``config.pixels``, or not finite.
-        """
+        """NumPy superquadrics (n,) of NumPy views (n, p, p).  Raises ValueError if the views are not (n, p, p) with p =
+        ``config.pixels``, or not finite."""
         return predict_in_positions(self.predict_once, check_views(views, self.config))
 
 
@@ -80,8 +78,7 @@ class HullPredictions:
 
 class ThingPredictor:
     """The network of things, made ready to predict: the means of support functions and covariances of each view and of
-    its mirror image, mirrored back, which err less; the body is that of the view itself.
-    """
+    its mirror image, mirrored back, which err less; the body is that of the view itself."""
 
     def __init__(self, network: forward.CompactThings | ThingNetwork) -> None:
         self.config = network.config
@@ -90,13 +87,8 @@ class ThingPredictor:
     def predict(
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray, mirror: bool = True
     ) -> HullPredictions:
-        """Bodies and hulls of views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown.
-
-        What the things stand on are planes (n, 4) in the frames of the views, zeros where there is none.  Without
-        ``mirror``, only the views themselves: in half of the time.
-
-        Raises ValueError for views of another form, or not finite.
-        """
+        """Bodies and hulls of views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown, on planes (n, 4) in
+        their frames, zeros for none; without ``mirror`` in half of the time.  Raises ValueError for other views."""
         views = check_views(views, self.config.regressor())
         if not mirror:
             of_views = self._network.predict(views, planes.astype(np.float32), extents.astype(np.float32))
@@ -115,11 +107,8 @@ class ThingPredictor:
 
 
 def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
-    """A predictor of bodies; the path as :func:`checkpoint.resolve` takes it.
-
-    Raises CheckpointError as :func:`checkpoint.read`, and for a network that only torch computes where there is no
-    torch.
-    """
+    """A predictor of bodies; the path as :func:`checkpoint.resolve` takes it.  Raises CheckpointError as
+    :func:`checkpoint.read`, and for a network that only torch computes where there is no torch."""
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
         return Predictor(config, forward.CompactRegressor(config, weights).predict)
@@ -154,11 +143,8 @@ def _is_cpu(device: str) -> bool:
 
 
 def check_device(device: str) -> str:
-    """The name of a device that is there, as torch names it.
-
-    Raises ValueError if it is none of cpu, cuda and cuda:N, or not the cpu and there is no torch, or torch sees no such
-    device.
-    """
+    """The name of a device that is there, as torch names it.  Raises ValueError if it is none of cpu, cuda and cuda:N,
+    or not the cpu and there is no torch, or torch sees no such device."""
     if device == "cpu":
         return device
     if (known := re.fullmatch(r"(cpu|cuda)(?::(\d+))?", device)) is None:

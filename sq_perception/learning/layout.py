@@ -15,14 +15,11 @@ from sq_perception.learning.network_config import BODY_OUTPUTS, EXTENT, PLANE, M
 
 Shapes = dict[str, tuple[int, ...]]
 
-COUNTER = ".num_batches_tracked"
-"""How the names of those counters end."""
-CELLS_AT_ONCE = 4
-"""Outputs of the network of masks at a pixel of its stem's half resolution: 2 x 2 cells."""
+COUNTER = ".num_batches_tracked"  # how the names of those counters end
+CELLS_AT_ONCE = 4  # outputs of the network of masks at a pixel of its stem's half resolution: 2 x 2 cells
 BLOCK = ("first", "first_norm", "second", "second_norm", "shortcut")
 """The modules of a residual block: two convolutions, each with its normalisation, and the way beside them."""
-TORCHVISION_BLOCK = ("conv1", "bn1", "conv2", "bn2", "downsample")
-"""What torchvision calls them in ResNet-18."""
+TORCHVISION_BLOCK = ("conv1", "bn1", "conv2", "bn2", "downsample")  # what torchvision calls them in ResNet-18
 
 
 def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:

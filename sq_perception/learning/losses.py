@@ -86,12 +86,8 @@ def parameter_loss(prediction: Superquadric, truth: Superquadric) -> torch.Tenso
 def occupancy_loss(
     prediction: Superquadric, truth: Superquadric, points: torch.Tensor, sharpness: float
 ) -> torch.Tensor:
-    """L_OC of each body, shape (n,).
-
-    prediction, truth: Torch batches (n,).
-    points: (n, N, 3) or (N, 3), where the occupancies are compared.
-    sharpness: s of equation 6.6; the surface is a transition about 1/s of the body wide.
-    """
+    """L_OC (n,) of torch batches, compared at ``points`` (n, N, 3) or (N, 3) with s = ``sharpness``: the surface is a
+    transition about 1/s of the body wide."""
     difference = prediction.occupancy(points, sharpness) - truth.occupancy(points, sharpness)
     return (difference * difference).mean(dim=-1)
 
@@ -121,12 +117,8 @@ def points_around(bodies: Superquadric, count: int, generator: torch.Generator, 
 
 
 def least_squares_loss(prediction: Superquadric, lines: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """L_LS of each body, (n,).
-
-    prediction: Torch batch (n,) in the view's frame.
-    lines, depth: (r, 2), (n, r), lines of sight and z where they end, 0 for background, as :func:`soft_render.of_view`
-        gives them.
-    """
+    """L_LS (n,) of a torch batch in the view's frame, for lines of sight (r, 2) and z (n, r) where they end, 0 for
+    background, as :func:`soft_render.of_view` gives them."""
     seen = depth > 0
     gauge = soft_render.gauge(prediction, lines, depth)
     # Background lines carry a number that is no depth: cut them off before the square, not after it.

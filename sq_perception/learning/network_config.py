@@ -19,23 +19,17 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning.choices import Backbone, Framing
 
-Array = Any
-"""A NumPy array or a torch tensor."""
-BODY_OUTPUTS = 14
-"""Numbers of a body: size 3, shape 2, translation 3, rotation 6."""
-PLANE, EXTENT = 4, 1
-"""Inputs of the network of things beside the view."""
+Array = Any  # a NumPy array or a torch tensor
+BODY_OUTPUTS = 14  # numbers of a body: size 3, shape 2, translation 3, rotation 6
+PLANE, EXTENT = 4, 1  # inputs of the network of things beside the view
 LEAST_LOG, MOST_LOG = -5.0, 0.5
 """Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
 
 
 @dataclass(frozen=True)
 class RegressorConfig:
-    """Everything that fixes the network's form; travels in the checkpoint's header.
-
-    Raises ValueError for an unknown backbone or framing, a side that the backbone cannot halve often enough, or an
-    empty range.
-    """
+    """Everything that fixes the network's form; travels in the checkpoint's header.  Raises ValueError for an unknown
+    backbone or framing, a side that the backbone cannot halve often enough, or an empty range."""
 
     pixels: int = 64  # side of the views: a multiple of 32 for resnet18, of 2 to the number of widths for compact
     widths: tuple[int, ...] = (32, 64, 128, 256)
@@ -74,11 +68,8 @@ class RegressorConfig:
     def view_of(
         self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
     ) -> CanonicalView:
-        """What a network is shown of the object under a mask; its predictions are in the frame of this view.
-
-        Arguments and errors are those of :func:`canonical_view.from_mask`; a network for full frames knows the unit
-        cube alone and refuses pinhole cameras.
-        """
+        """What a network is shown of the object under a mask, and the frame of its predictions; arguments and errors as
+        of :func:`canonical_view.from_mask`.  A network for full frames refuses pinhole cameras."""
         if self.framing == "full":
             return canonical_view.full_frame(depth, mask, camera, self.pixels)
         hidden = self.marks_hidden
@@ -86,10 +77,8 @@ class RegressorConfig:
 
     @classmethod
     def thesis(cls) -> RegressorConfig:
-        """The thesis' network for the thesis' images: ResNet-18, 256 x 256, the whole cube.
-
-        Its bodies have half sizes of 0.098 to 0.294 and centres of 0.35 to 0.66; the ranges leave room beside them.
-        """
+        """The thesis' network for the thesis' images: ResNet-18, 256 x 256, the whole cube.  Its bodies have half sizes
+        of 0.098 to 0.294 and centres of 0.35 to 0.66; the ranges leave room beside them."""
         return cls(
             pixels=256, size_range=(0.05, 0.4), translation_range=(0.0, 1.0), backbone="resnet18", framing="full"
         )
@@ -138,12 +127,8 @@ class MaskConfig:
 
 
 def side_inputs(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:
-    """What the network of things is shown beside views (b, p, p): heights (b, p, p) above planes (b, 4), and logarithms
-    (b,) of the views' sides ``extents`` (b,), metres, 0 for an unknown side.
-
-    Heights are in sides of the view: of the surface that a pixel shows, or, where it shows none, of the point at half
-    of the cube's depth.
-    """
+    """What the network of things is shown beside views (b, p, p): heights above planes (b, 4), in sides of the view, of
+    the surface or else of half the cube's depth, and logarithms (b,) of ``extents``, metres, 0 if unknown."""
     xp, pixels = array_namespace(views), views.shape[-1]
     across = (xp.arange(pixels, dtype=views.dtype, device=device(views)) + 0.5) / pixels
     n = planes[:, :, None, None]

@@ -72,19 +72,9 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.imaging.segment_view import CHANNELS
+from sq_perception.learning import network_config
 from sq_perception.learning.layout import BLOCK, CELLS_AT_ONCE, TORCHVISION_BLOCK, heads
-from sq_perception.learning.network_config import (
-    BODY_OUTPUTS,
-    EXTENT,
-    LEAST_LOG,
-    MOST_LOG,
-    PLANE,
-    MaskConfig,
-    RegressorConfig,
-    ThingConfig,
-    check_views,
-    side_inputs,
-)
+from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig
 
 
 class ResidualBlock(nn.Module):
@@ -196,11 +186,9 @@ class Regressor(nn.Module):
             return torch.cat([self.get_submodule(name)(h) for name in heads(self.config)], dim=-1)
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        """NumPy superquadrics (n,) of NumPy views (n, p, p).
-
-        Raises ValueError if the views are not (n, p, p) with p = ``config.pixels``, or not finite.
-        """
-        batch = torch.from_numpy(check_views(views, self.config))[:, None]
+        """NumPy superquadrics (n,) of NumPy views (n, p, p).  Raises ValueError if the views are not (n, p, p) with p =
+        ``config.pixels``, or not finite."""
+        batch = torch.from_numpy(network_config.check_views(views, self.config))[:, None]
         self.eval()
         device = next(self.parameters()).device
         with torch.inference_mode():
@@ -264,29 +252,29 @@ class ThingNetwork(nn.Module):
         count = len(DIRECTIONS)
         self.features = compact_backbone(config.widths, config.blocks, channels_in=2)
         inputs = config.widths[-1] * (config.pixels // self._encoding.stride) ** 2
+        inputs += network_config.PLANE + network_config.EXTENT
         self.mixer = nn.Sequential(
-            nn.Linear(inputs + PLANE + EXTENT, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden),
-            nn.ReLU(),
+            nn.Linear(inputs, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden), nn.ReLU()
         )
-        self.body_head = nn.Linear(config.hidden, BODY_OUTPUTS)
+        self.body_head = nn.Linear(config.hidden, network_config.BODY_OUTPUTS)
         self.support_head = nn.Linear(config.hidden, count)
         self.sigma_head = nn.Linear(config.hidden, count)
         self.factor_head = nn.Linear(config.hidden, count * config.factors)
         with torch.no_grad():
-            self.body_head.bias[BODY_OUTPUTS - 6 :].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
+            self.body_head.bias[network_config.BODY_OUTPUTS - 6 :].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
             self.support_head.bias.fill_(0.4)
             self.sigma_head.bias.fill_(-2.5)
             self.factor_head.weight.mul_(0.1)
 
     def forward(self, views: torch.Tensor, planes: torch.Tensor, extents: torch.Tensor) -> HullPrediction:
-        heights, scale = side_inputs(views, planes, extents)
+        heights, scale = network_config.side_inputs(views, planes, extents)
         h = self.features(torch.stack([views, heights], dim=1)).flatten(1)
         h = self.mixer(torch.cat([h, planes.to(h.dtype), scale[:, None].to(h.dtype)], dim=1)).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
             body = self._encoding.decode(self.body_head(h))
-            log_sigma = LEAST_LOG + nn.functional.softplus(self.sigma_head(h) - LEAST_LOG)
+            log_sigma = network_config.LEAST_LOG + nn.functional.softplus(self.sigma_head(h) - network_config.LEAST_LOG)
             factors = self.factor_head(h).unflatten(1, (len(DIRECTIONS), self.config.factors))
-            log_sigma = log_sigma.clamp_max(MOST_LOG) + 0.5 * math.log(self.config.spread)
+            log_sigma = log_sigma.clamp_max(network_config.MOST_LOG) + 0.5 * math.log(self.config.spread)
             factors = math.sqrt(self.config.spread) * factors
             return HullPrediction(body, self.support_head(h), log_sigma, factors, self.config.freedom)
 
@@ -294,9 +282,7 @@ class ThingNetwork(nn.Module):
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
         """The predictions for NumPy views (b, p, p), planes (b, 4) and extents (b,), in float32, in evaluation mode.
-
-        Bodies (b,), support functions (b, J) and their S (b, J, J), in the views' frames; NumPy.
-        """
+        Bodies (b,), support functions (b, J) and their S (b, J, J), in the views' frames; NumPy."""
         self.eval()
         device = next(self.parameters()).device
         with torch.inference_mode():

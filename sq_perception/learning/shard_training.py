@@ -116,13 +116,8 @@ def _to_stored(views: Any) -> dict[str, np.ndarray]:
 
 
 def train(kind: NetworkKind, config: ShardTraining, views: Path, output: Path) -> Any:
-    """Run, or continue, a training; returns the averaged network, also kept in ``output``/NAME.safetensors.
-
-    Raises ValueError if the folder holds no more shards than are kept for validation, or one that cannot be read, or
-    for a device that this machine does not have; OSError if a shard that is kept for validation is gone;
-    CheckpointError if a file to begin or to go on with does not fit; ArithmeticError or Stopped as
-    :func:`sq_perception.learning.training.run`.
-    """
+    """Run, or continue, a training; returns the averaged network, also kept in ``output``/NAME.safetensors.  Raises
+    ValueError for too few or damaged shards or an absent device, CheckpointError, and what :func:`run` raises."""
     device = torch.device(check_device(config.device))
     with threads(config.threads):
         torch.manual_seed(config.seed)
@@ -205,10 +200,8 @@ def validate_things(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
 
 
 def calibrate_spread(network: ThingNetwork, views: ThingViews) -> None:
-    """Scale S so that error / sigma deviates by 1 on these views; 4000 views settle it to 2 %.
-
-    The likelihood leaves 1.3, as it takes errors in longer tails than those of the t distribution for rare.
-    """
+    """Scale S so that error / sigma deviates by 1 on these views; 4000 views settle it to 2 %.  The likelihood leaves
+    1.3, as it takes errors in longer tails than those of the t distribution for rare."""
     spread = network.config.spread * validate_things(network, views)["ratio"] ** 2
     network.config = replace(network.config, spread=float(spread))
 

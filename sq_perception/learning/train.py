@@ -39,16 +39,11 @@ def train(
     config: TrainingConfig, output: Path, network: RegressorConfig | None = None,
     advance: Callable[[int, float], None] = lambda step, loss: None,
 ) -> Regressor:
-    """Run, or continue, a training; returns the averaged network, also saved in ``output``.
+    """Run, or continue, a training, of another form than that of ``config`` if given; returns the averaged network,
+    also saved in ``output``.  ``advance`` gets the steps done and the last loss.
 
-    config: The run.
-    output: The folder of the run.
-    network: A form other than that of ``config``.
-    advance: Called with the steps done and the loss of the last one.
-
-    Raises ArithmeticError or Stopped as :func:`sq_perception.learning.training.run`; CheckpointError if a file to begin
-    or to go on with does not fit; ValueError for a device that this machine does not have, or data or a network to
-    begin with of another form.
+    Raises CheckpointError, ValueError for data or a network to begin with of another form or an absent device, and what
+    :func:`run` raises.
     """
     device = torch.device(check_device(config.device))
     with threads(config.threads):
@@ -122,10 +117,8 @@ def validate(
 
 
 def recalibrate(model: Regressor, views: torch.Tensor, batch: int) -> None:
-    """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).
-
-    An average of weights has activations of its own: those recorded while the moving weights trained do not fit it.
-    """
+    """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).  An average of weights has
+    activations of its own: those recorded while the moving weights trained do not fit it."""
     device = next(model.parameters()).device
     whole = views[: len(views) // batch * batch].split(batch)
     update_bn((part.to(device, memory_format=torch.channels_last) for part in whole), model)

@@ -58,10 +58,8 @@ class Task:
 
 @dataclass(eq=False)
 class TrainingState:
-    """What a training holds between two steps; goes on from the file where there is one.
-
-    Raises CheckpointError if the file is damaged, or of a run with another network.
-    """
+    """What a training holds between two steps; goes on from the file where there is one.  Raises CheckpointError if the
+    file is damaged, or of a run with another network."""
 
     path: Path
     model: Any
@@ -82,10 +80,8 @@ class TrainingState:
 
     @classmethod
     def begin(cls, model: Any, config: Run, output: Path, form: tuple[str, ...] = ()) -> TrainingState:
-        """The state of a new run of a network, or of the one that ``output`` holds.
-
-        Raises CheckpointError also where that one differs in a setting of ``form``.
-        """
+        """The state of a new run of a network, or of the one that ``output`` holds.  Raises CheckpointError also where
+        that one differs in a setting of ``form``."""
         path, device = output / "state.safetensors", next(model.parameters()).device
         before = read_settings(path)
         other = [name for name in form if before.get(name, getattr(config, name)) != getattr(config, name)]
@@ -145,12 +141,9 @@ class TrainingState:
             raise CheckpointError(f"{self.path}: not the state of such a run: {reason}") from error
 
     def descend(self, loss: torch.Tensor, rate: float, keep: float) -> None:
-        """Make a step down the gradient of a loss at this rate, and let the averaged weights follow.
-
-        Early in a run they keep less than ``keep`` of themselves.
-
-        Raises ArithmeticError if the loss or its gradient is not finite; the weights are left as they are.
-        """
+        """Make a step down the gradient of a loss at this rate; averaged weights keep ``keep`` of themselves, less
+        early in a run.  Raises ArithmeticError if the loss or its gradient is not finite; the weights are then as they
+        were."""
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
@@ -187,11 +180,8 @@ def read_settings(state: Path) -> dict[str, Any]:
 def run(
     state: TrainingState, config: Run, task: Task, advance: Callable[[int, float], None] = lambda step, loss: None
 ) -> Any:
-    """Run a training to its end; returns the averaged network, which the folder of the state keeps.
-
-    Raises ArithmeticError when the loss or a gradient is no longer finite; the last saved state stays as it was;
-    Stopped after SIGINT or SIGTERM; the state is saved first.
-    """
+    """Run a training to its end; returns the averaged network, which the folder of the state keeps.  Raises
+    ArithmeticError when loss or gradient are not finite, Stopped after SIGINT or SIGTERM, when the state is saved."""
     device, losses, rate = next(state.model.parameters()).device, list[float](), 0.0
     began = saved = time.monotonic()
     began -= state.seconds
@@ -265,10 +255,8 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
 
 @contextmanager
 def threads(count: int) -> Iterator[None]:
-    """So many threads for a network and for the rendering of its views; 0 leaves both their own choice.
-
-    Each has a pool of its own, whose threads wait by spinning: beside other work a second one makes both much slower.
-    """
+    """So many threads for a network and for the rendering of its views; 0 leaves both their own choice.  Each has a
+    pool of its own, whose threads wait by spinning: beside other work a second one makes both much slower."""
     before = torch.get_num_threads(), numba.get_num_threads()
     if count:
         torch.set_num_threads(count)

@@ -111,10 +111,8 @@ class Run(ABC):
 
 @dataclass(frozen=True)
 class TrainingConfig(Run):
-    """A run of the regressor.  The defaults are those of the compact network under L_OC.
-
-    Raises ValueError for an unknown name, a number out of its range, or settings that contradict each other.
-    """
+    """A run of the regressor.  The defaults are those of the compact network under L_OC.  Raises ValueError for an
+    unknown name, a number out of its range, or settings that contradict each other."""
 
     loss: str = _setting("occupancy", "What is minimised; the equations are in sq_perception/learning/losses.py.")
     backbone: str = _setting("compact", "compact, or resnet18 as in the thesis.")
@@ -146,22 +144,18 @@ class TrainingConfig(Run):
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
-        for name, least in (("steps", 1), ("batch", 1), ("points", 2), ("validation", 1), ("reuse", 1)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name}: expected at least {least}, got {getattr(self, name)}")
-        for name in ("seed", "threads", "sharpness_start", "sharpness_end"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
-        for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
-        # Seeds are below it, as torch takes them.
-        if self.seed >= 2**63:
-            raise ValueError(f"seed: expected a number below 2^63, got {self.seed}")
-        if not self.learning_rate > 0:
-            raise ValueError(f"learning_rate: expected a positive number, got {self.learning_rate}")
-        if not 0 <= self.average < 1:
-            raise ValueError(f"average: expected 0 to below 1, got {self.average}")
+        for names, expected, holds in (
+            ("steps batch validation reuse", "at least 1", lambda v: v >= 1),
+            ("points", "at least 2", lambda v: v >= 2),
+            ("seed", "a number below 2^63 and of at least 0", lambda v: 0 <= v < 2**63),  # as torch takes them
+            ("threads sharpness_start sharpness_end", "a finite number of at least 0", lambda v: 0 <= v < math.inf),
+            ("pinhole_share wide_share occluded_share noisy_share", "a share from 0 to 1", lambda v: 0 <= v <= 1),
+            ("learning_rate", "a positive number", lambda v: v > 0),
+            ("average", "0 to below 1", lambda v: 0 <= v < 1),
+        ):
+            for name in names.split():
+                if not holds(getattr(self, name)):
+                    raise ValueError(f"{name}: expected {expected}, got {getattr(self, name)}")
         if self.loss in UNSUPERVISED and (self.occluded_share or self.noisy_share):
             raise ValueError(f"{self.loss} takes each view as it is; occluders and noise need a loss with labels")
         if self.framing == "full" and (self.pinhole_share or self.occluded_share or self.noisy_share):
@@ -201,17 +195,13 @@ class ShardTraining(Run):
         return seconds / (60 * self.minutes)
 
 
-THING_RUN = ShardTraining(minutes=120.0, learning_rate=8e-4, weight_decay=1e-4)
-"""The network of things."""
-MASK_RUN = ShardTraining(minutes=60.0, learning_rate=3e-3, weight_decay=1e-3)
-"""The network of masks."""
+THING_RUN = ShardTraining(minutes=120.0, learning_rate=8e-4, weight_decay=1e-4)  # the network of things
+MASK_RUN = ShardTraining(minutes=60.0, learning_rate=3e-3, weight_decay=1e-3)  # the network of masks
 
 
 def read(path: str | Path, **changes: Any) -> TrainingConfig:
-    """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.
-
-    Raises ValueError if there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
-    """
+    """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.  Raises
+    ValueError if there is no such file, or it holds anything but fields of :class:`TrainingConfig`."""
     return TrainingConfig(**{**_values(path), **changes})
 
 

@@ -33,8 +33,7 @@ from sq_perception.simulation.scenes import TABLE_CAMERA
 
 _MADE_OF = ("device", "threads", "method", "model")  # parameters that determine a recoverer
 
-Answer: TypeAlias = tuple[FrameRecovery, Hashable]
-"""The bodies of a frame, and a value that is equal for equal origins."""
+Answer: TypeAlias = tuple[FrameRecovery, Hashable]  # the bodies of a frame, and a value that is equal for equal origins
 
 
 class Turns:
@@ -67,8 +66,7 @@ class Turns:
             self.take()
 
 
-TURNS = Turns()
-"""The lock of this process."""
+TURNS = Turns()  # the lock of this process
 _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
 
 
@@ -121,12 +119,9 @@ class Engine:
         self._is_due = self._is_due or not changed.isdisjoint(_MADE_OF)
 
     def recover(self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None) -> Answer:
-        """Return the bodies of a frame with the current parameters, and a value that is equal for equal origins.
-
-        For the holder of the turn.  ``pose`` is that of the frame in ``target_frame``, if there is one.  With
-        ``tracking``, what did not change since the last frame is taken from its answer, if camera and origin are the
-        same.
-        """
+        """Return the bodies of a frame, ``pose`` in ``target_frame`` if there is one, and a value equal for equal
+        origins; for the holder of the turn.  With ``tracking``, what did not change comes from the last answer of this
+        origin."""
         if self._is_due:
             self._is_due = False
             self._replace(parameters)

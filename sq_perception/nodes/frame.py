@@ -139,11 +139,8 @@ def decode(
 
 
 def draw_masks(message: MaskMessage, size: tuple[int, int]) -> np.ndarray:
-    """Draw the masks of a yolo_msgs/DetectionArray as a label image, int32 (height, width).
-
-    Label k is the k-th detection; where two overlap, the one with the higher score is on top.  Raises ValueError if a
-    detection has no mask, or one of an image that is not ``size``, (width, height), pixels.
-    """
+    """Draw the masks of a yolo_msgs/DetectionArray as a label image, int32 (height, width): label k is the k-th
+    detection, the higher score on top.  Raises ValueError for one without a mask, or of an image of another size."""
     labels = np.zeros(size[::-1], np.int32)
     numbered = enumerate(message.detections, start=1)
     for number, detection in sorted(numbered, key=lambda one: float(one[1].score)):
@@ -166,11 +163,8 @@ def draw_masks(message: MaskMessage, size: tuple[int, int]) -> np.ndarray:
 
 
 def image_topic(node: Node, transport: str) -> str:
-    """Return the topic of depth images, with the node's namespace and remappings.
-
-    The transport is appended to the remapped ``depth/image``, unless that ends in it.  Points have a separate topic,
-    ``depth/points``.
-    """
+    """Return the topic of depth images, with the node's namespace and remappings.  The transport is appended to the
+    remapped ``depth/image``, unless that ends in it.  Points have a separate topic, ``depth/points``."""
     if transport == POINTS:
         return str(node.resolve_topic_name("depth/points"))
     resolved: str = node.resolve_topic_name("depth/image")

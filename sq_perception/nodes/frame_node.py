@@ -60,11 +60,8 @@ class Outcome(NamedTuple):
 
 
 class FrameNode(ManagedNode):
-    """Node for depth images; ``kind`` is its parameter dataclass, ``defaults`` override some of its defaults.
-
-    Raises ParameterError for a parameter that cannot be used.  A model that is missing or wrong is a fault of the
-    configuration, as it is read there.
-    """
+    """Node for depth images; ``kind`` is its parameter dataclass, ``defaults`` override some of its defaults.  Raises
+    ParameterError; a model that is missing or wrong is a fault of the configuration."""
 
     _action: ActionServer | None = None
 
@@ -194,7 +191,11 @@ class FrameNode(ManagedNode):
                     self._statistics.count("dropped", int(arrival is not None))
                     return
                 outcome = Outcome(False, f"{type(error).__name__}: {error}")
-                self._note_defect(outcome.text)
+                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
+                self._defects += 1
+                if self._defects == 10:
+                    self._engine.discard()
+                    self._fail(f"10 frames in a row failed, the last one by {outcome.text}")
             if arrival is not None:
                 self._conclude(arrival, outcome)
 
@@ -226,27 +227,16 @@ class FrameNode(ManagedNode):
             view = parameters.camera_frame, self._find_pose(arrival.message.header, parameters, "camera_frame")
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters, view)
-        answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
+        pose: Pose | None = unit_cube.POSE if frame.is_cube else None
+        if pose is None and parameters.target_frame and parameters.box is not None:  # the workspace, in that frame
+            turn, shift = self._find_pose(frame.header, parameters, "target_frame")
+            pose = tuple(turn.tolist()), tuple(shift.tolist())
+        answer = self._engine.recover(frame, parameters, pose)
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages
 
-    def _pose_of(self, frame: Frame, parameters: RecoverParameters) -> Pose | None:
-        """Return the pose of the optical frame in the frame of the results, if these differ and the workspace needs it.
-
-        ValueError if it is not known.
-        """
-        if frame.is_cube:
-            return unit_cube.POSE
-        if not parameters.target_frame or parameters.box is None:
-            return None
-        turn, shift = self._find_pose(frame.header, parameters, "target_frame")
-        return tuple(turn.tolist()), tuple(shift.tolist())
-
     def _find_pose(self, header: Any, parameters: RecoverParameters, name: str) -> CameraPose:
-        """Return the pose of a header's frame in that of the parameter ``name``; ValueError if it is unknown.
-
-        A transform that has not come yet is waited for while other cameras compute.
-        """
+        """Return the pose of a header's frame in that of a parameter; wait for it while other cameras compute."""
         frame = getattr(parameters, name)
         try:
             return pose_in(self._poses, header, frame, 0.0, name)
@@ -286,14 +276,6 @@ class FrameNode(ManagedNode):
                 caller.set_result(outcome)
                 if self.executor is not None:
                     self.executor.wake()  # a future that is awaited does not do that itself
-
-    def _note_defect(self, text: str) -> None:
-        """Log a program error, which costs this frame only."""
-        self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
-        self._defects += 1
-        if self._defects == 10:
-            self._engine.discard()
-            self._fail(f"10 frames in a row failed, the last one by {text}")
 
     # Services and diagnostics, in the executor's thread
 

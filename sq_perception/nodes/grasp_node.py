@@ -142,8 +142,7 @@ class GraspNode(ManagedNode):
                 self.destroy_publisher(publisher)
             self._outputs, self._array = [], None
 
-    def _cleanup(self) -> None:
-        self._deactivate()
+    _cleanup = _deactivate
 
     def _on_plane(self, message: PoseStamped) -> None:
         self._plane = message
@@ -184,25 +183,22 @@ class GraspNode(ManagedNode):
         self.report(standing, more)
 
     def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        cloud = self._last
-        found, response.message = self._plan_again(cloud)
-        if found and cloud:
-            response.success = True
-            response.message = answers.text_of(found, cloud.header, response.message)
+        found, response.message, cloud = self._plan_again()
+        if found:
+            response.success, response.message = True, answers.text_of(found, cloud.header, response.message)
         return response
 
     def _on_plan_array(self, request: Any, response: Any) -> Any:
-        cloud = self._last
-        found, response.message = self._plan_again(cloud)
-        if found and cloud:
+        found, response.message, cloud = self._plan_again()
+        if found:
             response.success, response.grasps = True, grasp_array(found, cloud.header)
         return response
 
     def _on_plan_grasps(self, request: Any, response: Any) -> Any:
-        code, target, cloud = response.error_code, request.target.id, self._last
+        code, target = response.error_code, request.target.id
         code.source = self.get_fully_qualified_name()
-        found, code.message = self._plan_again(cloud)
-        if found is None or cloud is None:
+        found, code.message, cloud = self._plan_again()
+        if found is None:
             code.val = code.FAILURE
             return response
         settings = self._settings.current
@@ -220,14 +216,16 @@ class GraspNode(ManagedNode):
         code.val = code.SUCCESS if response.grasps else code.PLANNING_FAILED
         return response
 
-    def _plan_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
+    def _plan_again(self) -> tuple[messages.GraspArray | None, str, Any]:
+        """Return grasps on the last cloud, or None and why, and that cloud."""
+        cloud = self._last
         if not self.is_active or cloud is None:
-            return None, "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
+            return None, "no superquadrics have come yet" if self.is_active else f"the node is {self.state}", cloud
         age, limit = self._age(cloud), self._settings.current.max_age
         if 0 < limit < age:
-            return None, f"the last superquadrics are {age:.1f} s old, and max_age is {limit:g} s"
+            return None, f"the last superquadrics are {age:.1f} s old, and max_age is {limit:g} s", cloud
         found, text = self._answer(cloud)
-        return found, f"{text}; {age:.1f} s old"
+        return found, f"{text}; {age:.1f} s old", cloud
 
     def _plane_in(self, header: Any) -> np.ndarray | None:
         """Return the last plane if it is in the frame of this header."""

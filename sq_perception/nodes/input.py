@@ -36,11 +36,8 @@ instead, a camera that sends so many within ``patience`` would never get an answ
 
 @dataclass(frozen=True)
 class Arrival:
-    """A depth image with its camera_info and mask.
-
-    ``size`` is None for a message that is no image and is refused at once.  ``time`` is its arrival, ``deadline`` the
-    end of its wait for camera_info and mask, seconds of the monotonic clock.
-    """
+    """A depth image with its camera_info and mask; ``size`` is None for a message that is no image and is refused at
+    once.  ``time`` is its arrival, ``deadline`` the end of its wait, seconds of the monotonic clock."""
 
     message: DepthMessage
     size: tuple[int, int] | None
@@ -59,10 +56,8 @@ class _Info:
 
 
 class Input:
-    """The subscriptions of an active node and their messages.
-
-    An image that comes while none ``is_wanted`` is dropped at once.
-    """
+    """The subscriptions of an active node and their messages.  An image that comes while none ``is_wanted`` is dropped
+    at once."""
 
     def __init__(
         self, node: Node, settings: LiveParameters[RecoverParameters], is_wanted: Callable[[], bool],
@@ -158,10 +153,8 @@ class Input:
             return arrival
 
     def frame(self, arrival: Arrival, parameters: RecoverParameters, view: tuple[str, Pose] | None = None) -> Frame:
-        """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.
-
-        Raises ValueError for anything that keeps it from being processed.
-        """
+        """Decode an image with its camera_info and mask; points are moved into the frame of a ``view``.  Raises
+        ValueError for anything that keeps it from being processed."""
         message, use, source = arrival.message, parameters.use_masks, self._info
         frame = frames.decode(
             message, None if source is None else lambda: self._calibration_of(message, source),
@@ -283,11 +276,8 @@ class Input:
         return has_info and (not arrival.needs_mask or stamp in self._masks)
 
     def _info_for(self, size: tuple[int, int], stamp: int) -> tuple[_Info | None, bool]:
-        """Return the camera_info of an image, or the latest of its size, and whether the image need not wait.
-
-        Drivers publish it after its image.  Where it changes, as with a region of interest that follows something,
-        another one's would shift every body.
-        """
+        """Return the camera_info of an image, or the latest of its size, and whether the image need not wait: drivers
+        publish it later, and where it changes another one's would shift every body."""
         fitting = [info for info in self._infos if info.size == size]
         if own := [info for info in fitting if info.stamp == stamp]:
             return own[-1], True

@@ -33,10 +33,8 @@ _RELIABILITIES = {
 
 
 class Listener:
-    """A subscription whose ``statistics`` count lost messages.  Call :meth:`follow` each second.
-
-    Raises ValueError for an override that is no reliability.
-    """
+    """A subscription whose ``statistics`` count lost messages.  Call :meth:`follow` each second.  Raises ValueError for
+    an override that is no reliability."""
 
     def __init__(
         self, node: Node, kind: type[Any], topic: str, callback: Callable[[Any], None], statistics: Statistics

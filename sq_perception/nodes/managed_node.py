@@ -108,10 +108,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self.state not in ("unconfigured", "finalized", "unknown")
 
     def start(self, autostart: bool = True) -> None:
-        """Configure and activate, now and after a fault; :attr:`start_failure` holds the reason of a failure.
-
-        Without ``autostart`` only log that a manager must do so.
-        """
+        """Configure and activate, now and after a fault; :attr:`start_failure` holds the reason of a failure.  Without
+        ``autostart`` only log that a manager must do so."""
         if not autostart:
             self.get_logger().info(
                 "unconfigured, as autostart is false: waiting for a lifecycle manager, or for ros2 lifecycle set "
@@ -137,10 +135,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return level, f"{self.state}: {fault}" if fault else self.state
 
     def close(self) -> bool:
-        """Release everything; called once, before destroy_node.  False if a transition does not end in time.
-
-        The state becomes ``finalized`` where it was one that allows it.
-        """
+        """Release everything; called once, before destroy_node.  False if a transition does not end in time.  The state
+        becomes ``finalized`` where it was one that allows it."""
         self._closing.set()
         self._tasks.put(self._end)
         self._tasks.put(None)
@@ -148,10 +144,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return not self._thread.is_alive()
 
     def destroy_node(self) -> None:
-        """Destroy the node as rclpy does, and the publisher of the transitions.
-
-        rclpy leaves that one to the garbage collector: it stayed in the graph for as long as the process lived.
-        """
+        """Destroy the node as rclpy does, and the publisher of the transitions.  rclpy leaves that one to the garbage
+        collector: it stayed in the graph for as long as the process lived."""
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 

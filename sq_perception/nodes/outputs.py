@@ -133,10 +133,8 @@ def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float, par
 
 
 def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
-    """Return findings in another tf2 frame; unchanged for an empty ``frame_id``.
-
-    Raises ValueError as :func:`pose_in`: nothing may be published in a wrong frame.
-    """
+    """Return findings in another tf2 frame; unchanged for an empty ``frame_id``.  Raises ValueError as :func:`pose_in`:
+    nothing may be published in a wrong frame."""
     return found.move(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 

@@ -46,10 +46,8 @@ def setting(
 
 @dataclass(frozen=True)
 class Parameters:
-    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.
-
-    Raises ParameterError for a value that is none of the choices, or does not fit the others.
-    """
+    """The parameters of a node.  rclpy checks types and ranges by the descriptors; here, how they fit together.  Raises
+    ParameterError for a value that is none of the choices, or does not fit the others."""
 
     def __post_init__(self) -> None:
         for parameter in fields(self):
@@ -151,8 +149,7 @@ def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescripto
     return descriptor
 
 
-RAW, POINTS = "raw", "points"
-"""Plain images, and clouds of points, as image_transport names them."""
+RAW, POINTS = "raw", "points"  # plain images, and clouds of points, as image_transport names them
 EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
 _KEEPS_ALL = 100.0  # metres: the value of depth_max that keeps all readings
 

@@ -36,8 +36,7 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_F
 """Spinning threads take cores from other nodes, and small solves and images gain nothing from a second thread."""
 
 _Node = TypeVar("_Node", bound="Stoppable")
-REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-"""Advice if rclpy is missing."""
+REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"  # advice if rclpy is missing
 
 
 class Stoppable(Protocol):
@@ -54,11 +53,8 @@ class Stoppable(Protocol):
 
 
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
-    """Create nodes and spin them until they are asked to stop; return the exit code.
-
-    ``create`` imports what the nodes need, so that this function handles signals during the seconds of imports.  Nodes
-    that it has yielded are closed even if a later one cannot be made.
-    """
+    """Create nodes and spin them until they are asked to stop; return the exit code.  ``create`` imports what they
+    need, so that signals are handled meanwhile; what it has yielded is closed even if a later one fails."""
     if importlib.util.find_spec("rclpy") is None:
         print(f"{name} needs ROS 2 in Python: {REMEDY}", file=sys.stderr)
         return 1
@@ -136,11 +132,8 @@ def additions() -> dict[str, str]:
 
 
 def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
-    """Create a node of this class.
-
-    If that fails, the unfinished node is destroyed before the error is raised: its shared memory would outlive this
-    process, and a launch file tries again and again.
-    """
+    """Create a node of this class.  If that fails, the unfinished node is destroyed before the error is raised: its
+    shared memory would outlive this process, and a launch file tries again and again."""
     node = kind.__new__(kind)
     try:
         node.__init__(*arguments, **named)  # type: ignore[misc]  # of the class itself
@@ -152,10 +145,8 @@ def make(kind: type[_Node], *arguments: Any, **named: Any) -> _Node:
 
 
 def share_heaps() -> None:
-    """Let threads allocate from the same heaps; heaps of their own keep what a frame has freed, 25 MB in all.
-
-    Changes nothing without glibc.  For the start of a process: heaps that are there already stay.
-    """
+    """Let threads allocate from the same heaps; heaps of their own keep what a frame has freed, 25 MB in all.  Changes
+    nothing without glibc.  For the start of a process: heaps that are there already stay."""
     with suppress(AttributeError):
         ctypes.CDLL(None).mallopt(-8, 2)  # M_ARENA_MAX of malloc.h; with one heap threads wait for each other
 

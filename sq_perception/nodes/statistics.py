@@ -15,19 +15,14 @@ from time import monotonic
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
-THROTTLE = 5.0
-"""Seconds between two log messages of the same place."""
+THROTTLE = 5.0  # seconds between two log messages of the same place
 OLDEST = 3600.0
 """Seconds; older messages, or ones from the future, come from a bag or another clock, and their age is ignored."""
-SECONDS = 10.0
-"""Window of rates and latencies, seconds."""
-WITHOUT_MASK = "without mask"
-"""Frames that the node segmented although masks are published."""
-DOUBTED = "doubted"
-"""Frames that seem to have another unit or kind."""
+SECONDS = 10.0  # window of rates and latencies, seconds
+WITHOUT_MASK = "without mask"  # frames that the node segmented although masks are published
+DOUBTED = "doubted"  # frames that seem to have another unit or kind
 _OUTCOMES = ("answered", "dropped", "refused")
-Standing = tuple[bytes, str]
-"""Level and message of a DiagnosticStatus."""
+Standing = tuple[bytes, str]  # level and message of a DiagnosticStatus
 
 
 class Statistics:
@@ -75,11 +70,8 @@ class Statistics:
         self.count("answered")
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
-        """Return the diagnostics of a node, with ``more`` facts beside the frames.
-
-        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused, doubted,
-        lost or left without a mask since the last status.
-        """
+        """Return the diagnostics of a node, with ``more`` facts.  ``standing`` goes first; without it WARN where frames
+        come and none is answered, or some were refused, doubted, lost or left without a mask since the last status."""
         with self._lock:
             now = self._clock()
             counts, lost = Counter(self._counts), Counter(self._lost)

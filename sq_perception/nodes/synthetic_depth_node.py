@@ -110,8 +110,7 @@ class SourceFrame(RecordedFrame):
     truth: Superquadric | None = None
 
 
-Maker = Callable[[int], SourceFrame]
-"""Makes the k-th image without noise, the same one for each call."""
+Maker = Callable[[int], SourceFrame]  # makes the k-th image without noise, the same one for each call
 
 
 class FrameSource:
@@ -127,11 +126,9 @@ class FrameSource:
         self.clean = make(0)  # the current image without noise
 
     def next(self, noise: float, sensor: str = IDEAL) -> SourceFrame | None:
-        """Return the next image as the sensor measures it; None after the last one.
-
-        ``noise`` is that of the ideal sensor, metres, or grey levels of 255 for the unit cube.  Raises ValueError if a
-        recording cannot be read (the one after it is next), or the sensor cannot have taken the image.
-        """
+        """Return the next image as the sensor measures it; None after the last one.  ``noise`` of the ideal sensor in
+        metres, or grey levels of 255.  Raises ValueError for an unreadable recording, or one that the sensor cannot
+        have taken."""
         if self._left == 0:
             self._position += 1
             if self._count and self._position >= self._count:

@@ -54,12 +54,9 @@ class CameraPoses:
         self._listener = tf2.TransformListener(self._buffer, self._node)
 
     def at(self, header: Any, frame: str, patience: float = 0.1) -> Pose:
-        """Return the pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.  Raises
-        PoseError.
-
-        It is waited for, ``patience`` seconds at most; transforms arrive in the node's executor, in whose thread this
-        must not be called.
-        """
+        """Return the pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0, after
+        ``patience`` seconds at most; PoseError if it is unknown.  Not for the executor's thread, in which transforms
+        arrive."""
         if header.frame_id == frame:
             return np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
         self.listen()
@@ -80,11 +77,8 @@ class CameraPoses:
         return quaternion / length, translation
 
     def follow(self, stamp: int) -> None:
-        """Note the stamp of the next image, nanoseconds, before its pose is requested.
-
-        After a jump back, as when a recording restarts, the buffer is cleared: old transforms would shadow new ones,
-        and tf2 accepts none that is 10 s older than its newest.
-        """
+        """Note the stamp of the next image, nanoseconds, before its pose is requested.  After a jump back the buffer is
+        cleared: old transforms would shadow new ones, and tf2 accepts none 10 s older than its newest."""
         if stamp < self._stamp and self._buffer is not None:
             self._buffer.clear()
         self._stamp = stamp
@@ -117,11 +111,9 @@ class Tracking:
     def identify(
         self, recovery: FrameRecovery, origin: Hashable, frame: Frame, arrival: float, parameters: RecoverParameters
     ) -> Identified:
-        """Return bodies with the ids of their tracks; without ``tracking`` ids are labels, and tracks are dropped.
-
-        Numbers of another ``origin``, method or model, are not fused with these: a change ends the tracks.  ``arrival``
-        is the time, seconds, of an image without stamp.  Raises ValueError if the tracker cannot go on; it begins anew.
-        """
+        """Return bodies with the ids of their tracks, or labels without ``tracking``; a change of ``origin``, method or
+        model, ends the tracks.  ``arrival``: seconds, for images without stamp.  Raises ValueError if the tracker
+        begins anew."""
         if not parameters.tracking:
             self._session.reset()
             return identify(recovery)

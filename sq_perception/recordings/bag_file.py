@@ -242,9 +242,7 @@ class RecordedBag:
 
     def _mask(self, stamp: Stamp) -> Message | None:
         """Return the first mask with this stamp; None without one, and for an image without a stamp, as a node has it.
-
-        Raises ValueError where there is none, and one that cannot be read might be it.
-        """
+        Raises ValueError where there is none, and one that cannot be read might be it."""
         if stamp == Stamp(0, 0):
             return None
         if stamp in self._mask_times:

@@ -23,8 +23,7 @@ from sq_perception.imaging import compressed_depth
 from sq_perception.recordings import publication
 from sq_perception.recordings.frame_file import FrameError, Stamp
 
-LARGEST = MOST_BYTES
-"""Bytes of one message, or of one unpacked chunk of messages."""
+LARGEST = MOST_BYTES  # bytes of one message, or of one unpacked chunk of messages
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _ZSTD = b"\x28\xb5\x2f\xfd"  # what a message that was packed by itself begins with; a plain one begins with the byte 0
@@ -53,9 +52,7 @@ def camera_info_topic(topic: str) -> str:
 
 def info_topic(reader: BagReader, topic: str, image: Message | None, wanted: str | None) -> InfoTopic:
     """Return the camera_info topic for the images of a topic, of which one is given, or the one that was asked for.
-
-    Raises FrameError if the bag has not the one that was asked for.
-    """
+    Raises FrameError if the bag has not the one that was asked for."""
     names = sorted({connection.topic for connection in reader.connections(CAMERA_INFO)})
     listed = ", ".join(names) or "none"
     if wanted is not None:

@@ -45,29 +45,25 @@ CAMERA_FILES = (
 )
 """Names of the camera beside images."""
 
-_FX, _FY, _CX, _CY = "fx", "fy", "cx", "cy"
-_MATRIX, _PROJECTION, _WIDTH, _HEIGHT, _SIZE = "matrix", "projection matrix", "width", "height", "size"
-_COEFFICIENTS, _LENS, _MODEL, _UNIT = "distortion", "distortion model", "model", "unit"
 _NAMES = {
-    **dict.fromkeys(("fx", "fl x", "f x", "focal x", "focal length x", "fu"), _FX),
-    **dict.fromkeys(("fy", "fl y", "f y", "focal y", "focal length y", "fv"), _FY),
-    **dict.fromkeys(("cx", "c x", "ppx", "center x", "principal point x"), _CX),
-    **dict.fromkeys(("cy", "c y", "ppy", "center y", "principal point y"), _CY),
+    **dict.fromkeys(("fx", "fl x", "f x", "focal x", "focal length x", "fu"), "fx"),
+    **dict.fromkeys(("fy", "fl y", "f y", "focal y", "focal length y", "fv"), "fy"),
+    **dict.fromkeys(("cx", "c x", "ppx", "center x", "principal point x"), "cx"),
+    **dict.fromkeys(("cy", "c y", "ppy", "center y", "principal point y"), "cy"),
     **dict.fromkeys(("f", "focal", "focal length"), "f"),
     **dict.fromkeys(("pp", "principal point"), "pp"),
     **dict.fromkeys(("matrix", "k", "intrinsic", "intrinsics", "intrinsic matrix", "intrinsics matrix", "mtx"),
-                    _MATRIX),
-    **dict.fromkeys(("projection matrix", "p"), _PROJECTION),
-    **dict.fromkeys(("width", "w"), _WIDTH),
-    **dict.fromkeys(("height", "h"), _HEIGHT),
-    **dict.fromkeys(("resolution", "size"), _SIZE),
+                    "matrix"),
+    **dict.fromkeys(("projection matrix", "p"), "projection matrix"),
+    **dict.fromkeys(("width", "w"), "width"),
+    **dict.fromkeys(("height", "h"), "height"),
+    **dict.fromkeys(("resolution", "size"), "size"),
     **dict.fromkeys(("distortion coefficients", "distortion coeffs", "distortion", "d", "coeffs", "dist coeffs",
                      "dist coefs", "dist"),
-                    _COEFFICIENTS),
-    "distortion model": _LENS,
-    "model": _MODEL,
-    **dict.fromkeys(("scale", "map factor", "factor", "shift", "unit scale factor", "unit", "units"), _UNIT),
-    **{name: name for name in ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "roi", "binning x", "binning y")},
+                    "distortion"),
+    **dict.fromkeys(("scale", "map factor", "factor", "shift", "unit scale factor", "unit", "units"), "unit"),
+    **{name: name for name in ("distortion model", "model", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "roi",
+                               "binning x", "binning y")},
 }  # fmt: skip
 """What a name means, without the words that say of what it is."""
 _WORDS = re.compile(r"[A-Z]?[a-z]+\d*|[A-Z]+(?![a-z])\d*|\d+")
@@ -116,13 +112,11 @@ class CameraInfo:
 
 
 def read_calibration(
-    source: str | Path, distortion: Treatment = "auto", name: str = "", size: tuple[int, int] | None = None
+    source: str | Path, distortion: Treatment = "auto", size: tuple[int, int] | None = None
 ) -> Calibration:
-    """Return the calibration of images called ``name``, as :func:`read_camera_info` has it.
-
-    Raises FrameError as :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
-    """
-    return calibration(read_camera_info(source, size), source, distortion, name)
+    """Return the calibration of images without a name, of a camera as :func:`read_camera_info` has it.  Raises
+    FrameError as that does, or if the camera is not calibrated or its distortion not known."""
+    return calibration(read_camera_info(source, size), source, distortion, "")
 
 
 def calibration(info: CameraInfo, source: str | Path, distortion: Treatment, name: str) -> Calibration:
@@ -134,18 +128,13 @@ def calibration(info: CameraInfo, source: str | Path, distortion: Treatment, nam
 
 
 def read_camera_info(source: str | Path, size: tuple[int, int] | None = None, name: str | None = None) -> CameraInfo:
-    """Return the camera of a file, or of four numbers; see the module.
-
-    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
-
-    ``size``: width and height of the images, where nothing states them.  ``name``: of the image without
-    suffix: its number tells which of a scene's cameras it has.  None: any image's will do.
-    """
+    """Return the camera of a file, or of four numbers; see the module.  ``size``: width and height where nothing states
+    them; ``name`` of the image, whose number tells the camera of a scene, None for any."""
     try:
         if not os.path.exists(source) and (numbers := _numbers(str(source))) is not None:
             if len(numbers) != 4:
                 raise FrameError(f"expected four numbers, fx,fy,cx,cy, got {len(numbers)}")
-            document: Any = dict(zip((_FX, _FY, _CX, _CY), numbers, strict=True))
+            document: Any = dict(zip(("fx", "fy", "cx", "cy"), numbers, strict=True))
         else:
             document = camera_document.read(Path(source))
         found = _choose(document, size, name)
@@ -198,7 +187,7 @@ def _choose(document: Any, size: tuple[int, int] | None, name: str | None) -> Ca
     found = list(_cameras(document))
     whole = [one for one in found if _has_camera(one)]
     if not whole:
-        wanted = (_FX, _FY, _CX, _CY)
+        wanted = ("fx", "fy", "cx", "cy")
         if has := max(([field for field in wanted if field in one.fields] for one in found), key=len, default=None):
             missing = ", ".join(field for field in wanted if field not in has)
             raise FrameError(f"expected {missing} (or other names for them) beside {', '.join(has)}")
@@ -236,14 +225,14 @@ def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None
             group = "depth" if "depth" in words else "colour" if any(word in _COLOUR for word in words) else ""
             words = [word for word in words if word.rstrip("0123456789") not in (*_OF_WHAT, *_COLOUR, "depth")]
             field = _NAMES.get(" ".join(words))
-            field = _LENS if field == _COEFFICIENTS and isinstance(value, str) else field
-            if field is not None and (field != _UNIT or group == "depth" or "map" in words):
+            field = "distortion model" if field == "distortion" and isinstance(value, str) else field
+            if field is not None and (field != "unit" or group == "depth" or "map" in words):
                 groups[group].setdefault(field, (str(name), value))
         of_way = {word.lower() for part in way for word in _WORDS.findall(part)}
         is_colour, is_depth = not of_way.isdisjoint(_COLOUR), "depth" in of_way
         if any(_has_camera(_Found(way, groups[name], False, False)) for name in ("depth", "colour")):
             for group in ("depth", "colour"):
-                fields = {**groups[""], **groups[group], **{k: v for k, v in groups["depth"].items() if k == _UNIT}}
+                fields = {**groups[""], **groups[group], **{k: v for k, v in groups["depth"].items() if k == "unit"}}
                 yield _Found((*way, group), fields, group == "colour", group == "depth")
         elif fields := {**groups["colour"], **groups[""], **groups["depth"]}:
             yield _Found(way, fields, is_colour, is_depth)
@@ -256,9 +245,9 @@ def _cameras(node: Any, way: tuple[str, ...] = (), left: list[int] | None = None
 def _has_camera(one: _Found) -> bool:
     fields = one.fields
     return (
-        _is_matrix(one.get(_MATRIX))
-        or _is_matrix(one.get(_PROJECTION))
-        or ((fields.keys() >= {_FX, _FY} or "f" in fields) and (fields.keys() >= {_CX, _CY} or "pp" in fields))
+        _is_matrix(one.get("matrix"))
+        or _is_matrix(one.get("projection matrix"))
+        or ((fields.keys() >= {"fx", "fy"} or "f" in fields) and (fields.keys() >= {"cx", "cy"} or "pp" in fields))
     )
 
 
@@ -270,14 +259,15 @@ def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
     width, height = _sides(one, size) or (0, 0)
     if not width or not height:
         raise FrameError("expected image_width and image_height (or width and height)")
-    projection = _numbers_of(one, _PROJECTION, (12,)) if _is_matrix(one.get(_PROJECTION)) else np.zeros(12)
+    has_projection = _is_matrix(one.get("projection matrix"))
+    projection = _numbers_of(one, "projection matrix", (12,)) if has_projection else np.zeros(12)
     matrix = _matrix(one)
     lens = _lens(one)
-    coefficients = _numbers_of(one, _COEFFICIENTS, None)
+    coefficients = _numbers_of(one, "distortion", None)
     if not coefficients.size and (lens == "equidistant" or "k1" in one.fields):
         order = "k1 k2 k3 k4" if lens == "equidistant" else "k1 k2 p1 p2 k3 k4 k5 k6"
         coefficients = np.array([_number(one, name) for name in order.split()])
-    name, unit = one.fields.get(_UNIT, ("", None))
+    name, unit = one.fields.get("unit", ("", None))
     if isinstance(unit, list) and len(unit) == 1:
         unit = unit[0]
     is_unit = isinstance(unit, int | float) and not isinstance(unit, bool)
@@ -294,17 +284,17 @@ def _camera_info(one: _Found, size: tuple[int, int] | None) -> CameraInfo:
 
 def _sides(one: _Found, size: tuple[int, int] | None) -> tuple[int, int] | None:
     """Width and height of a camera's images; ``size`` where they are not stated."""
-    given = one.get(_SIZE)
+    given = one.get("size")
     if isinstance(given, list) and len(given) == 2:
         width, height = given
-    elif _WIDTH not in one.fields and _HEIGHT not in one.fields:
+    elif "width" not in one.fields and "height" not in one.fields:
         return size
     else:
-        if _WIDTH not in one.fields or _HEIGHT not in one.fields:
+        if "width" not in one.fields or "height" not in one.fields:
             raise FrameError("expected both image_width and image_height (or width and height)")
-        width, height = one.get(_WIDTH), one.get(_HEIGHT)
+        width, height = one.get("width"), one.get("height")
     sides = []
-    for name, value in ((_WIDTH, width), (_HEIGHT, height)):
+    for name, value in (("width", width), ("height", height)):
         value = int(value) if isinstance(value, float) and value.is_integer() else value
         side = _count(value, name)
         if side < 1:
@@ -316,19 +306,19 @@ def _sides(one: _Found, size: tuple[int, int] | None) -> tuple[int, int] | None:
 def _matrix(one: _Found) -> np.ndarray:
     """Return K, flat, row by row; zeros where only a projection matrix is given."""
     fields = one.fields
-    if fields.keys() >= {_CX, _CY} and (fields.keys() >= {_FX, _FY} or "f" in fields):
-        fx, fy = (_number(one, name if name in fields else "f") for name in (_FX, _FY))
-        return np.array([fx, 0, _number(one, _CX), 0, fy, _number(one, _CY), 0, 0, 1])
+    if fields.keys() >= {"cx", "cy"} and (fields.keys() >= {"fx", "fy"} or "f" in fields):
+        fx, fy = (_number(one, name if name in fields else "f") for name in ("fx", "fy"))
+        return np.array([fx, 0, _number(one, "cx"), 0, fy, _number(one, "cy"), 0, 0, 1])
     if "pp" in fields and "f" in fields:
         (fx, fy), (cx, cy) = np.broadcast_to(_numbers_of(one, "f", (1, 2)), 2), _numbers_of(one, "pp", (2,))
         return np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
-    if not _is_matrix(one.get(_MATRIX)):
+    if not _is_matrix(one.get("matrix")):
         return np.zeros(9)
-    numbers = _numbers_of(one, _MATRIX, (4, 9, 12, 16))
+    numbers = _numbers_of(one, "matrix", (4, 9, 12, 16))
     if numbers.size == 4:
         fx, fy, cx, cy = numbers
         return np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])
-    name = fields[_MATRIX][0]
+    name = fields["matrix"][0]
     matrix = numbers.reshape(-1, 3 if numbers.size == 9 else 4)
     if matrix[2, :2].any() and not matrix[:2, 2].any() and numbers.size != 12:  # column by column
         matrix = matrix.T
@@ -342,7 +332,7 @@ def _matrix(one: _Found) -> np.ndarray:
 
 def _lens(one: _Found) -> str:
     """Return the distortion model of a camera, by the name that messages have for it."""
-    for field in (_LENS, _MODEL):
+    for field in ("distortion model", "model"):
         given = one.get(field)
         if given is None:
             continue
@@ -350,7 +340,7 @@ def _lens(one: _Found) -> str:
         known = _LENSES.get(" ".join(word for word in words if word != "distortion"))
         if known is not None and known != "plumb_bob":
             return known
-        if known is None and field == _LENS:
+        if known is None and field == "distortion model":
             return str(given)  # which Calibration refuses where there is a distortion
         if "theta" in words:
             raise FrameError(f"{one.fields[field][0]}: expected {', '.join(set(_LENSES.values()))}, got {given!r}")

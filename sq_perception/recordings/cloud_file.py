@@ -26,11 +26,9 @@ from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.tracking.state import parse_pose
 
 SUFFIXES = (".pcd", ".ply")
-LABEL_FIELDS = ("instance", "label")
-"""Fields with the object of each point; the first of them that is there counts."""
+LABEL_FIELDS = ("instance", "label")  # fields with the object of each point; the first of them that is there counts
 LABELLED = "the labels of the points are the masks of objects (ignore masks: segment instead)"
-MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")
-"""Files that may hold a mesh; a PLY or OBJ may be a cloud as well."""
+MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off")  # files that may hold a mesh; a PLY or OBJ may be a cloud as well
 UNORGANISED = (
     "a cloud that is no image, seen from its origin, without points more than 60 degrees off its axis: nothing is "
     "known of the space beside an object, so that the side that is not seen is less sure; a depth image or an "
@@ -106,10 +104,8 @@ def _check_size(path: Path) -> None:
 
 
 def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage:
-    """Return the image of points (height, width, 3) and their labels (height, width).
-
-    Raises UnpackingError if they do not lie before a camera in the origin that looks along z.
-    """
+    """Return the image of points (height, width, 3) and their labels (height, width).  Raises UnpackingError if they do
+    not lie before a camera in the origin that looks along z."""
     least = 100
     with np.errstate(all="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
@@ -152,9 +148,7 @@ def as_image(points: np.ndarray, labels: np.ndarray | None = None) -> CloudImage
 
 def _layered_share(tangents: np.ndarray, z: np.ndarray) -> float:
     """Return the share of points whose neighbours in the image lie on no common plane: those of a front and a back.
-
-    Seven to nine in ten of an object's from all sides, one in five of a sparse one of a crowded table from one.
-    """
+    Seven to nine in ten of an object's from all sides, one in five of a sparse one of a crowded table from one."""
     from scipy.spatial import cKDTree
 
     some = np.linspace(0, len(z) - 1, min(500, len(z))).astype(int)
@@ -299,10 +293,8 @@ def _unpack(packed: np.ndarray, out: np.ndarray) -> bool:
 
 @dataclass(frozen=True)
 class CloudFrame:
-    """Where the camera is in the frame of a cloud: its place, and its rotation where that is known.
-
-    With R, t the pose of its optical frame in the cloud's frame, p_optical = R^T (p - t), metres.
-    """
+    """Where the camera is in the frame of a cloud: its place, and its rotation where that is known.  With R, t the pose
+    of its optical frame in the cloud's frame, p_optical = R^T (p - t), metres."""
 
     place: tuple[float, ...]
     quaternion: tuple[float, ...] | None

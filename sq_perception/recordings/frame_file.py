@@ -129,10 +129,8 @@ class Reading:
         return depth_units.z_from_range(depth, camera) if self.kind == "range" else depth
 
     def labels(self, name: str, like: np.ndarray) -> np.ndarray | None:
-        """Return the label image (height, width) of a frame, int32; None without a folder of them.
-
-        Raises FrameError if it is missing, unreadable, or not of the size of the image ``like``.
-        """
+        """Return the label image (height, width) of a frame, int32; None without a folder of them.  Raises FrameError
+        if it is missing, unreadable, or not of the size of the image ``like``."""
         if self.masks is None or self.ignore_masks:
             return None
         try:
@@ -146,10 +144,8 @@ class Reading:
         return labels
 
     def of(self, frame: RecordedFrame) -> RecordedFrame:
-        """Return the frame within the limits, with a warning where it seems to be another kind of image.
-
-        Raises FrameError if the region is not within the image.
-        """
+        """Return the frame within the limits, with a warning where it seems to be another kind of image.  Raises
+        FrameError if the region is not within the image."""
         frame = replace(frame, warning="; ".join(filter(None, (frame.warning, _likely_mistake(frame)))))
         if self == Reading():
             return frame

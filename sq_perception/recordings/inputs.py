@@ -38,12 +38,9 @@ SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 """A file with its camera, or what cannot be read, and why."""
 _log = logging.getLogger(__name__)
-ANY_SIZE = (640, 480)
-"""Pixels, of images that nothing is known of yet."""
-INTERVAL = 0.1
-"""Seconds."""
-Pose = tuple[np.ndarray, np.ndarray]
-"""Quaternion x y z w (4,), translation (3,)."""
+ANY_SIZE = (640, 480)  # pixels, of images that nothing is known of yet
+INTERVAL = 0.1  # seconds
+Pose = tuple[np.ndarray, np.ndarray]  # quaternion x y z w (4,), translation (3,)
 
 
 class RecordedInput:
@@ -155,10 +152,8 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
 
 
 class CameraPoses:
-    """The poses of a file.
-
-    Raises OSError if it cannot be read; ValueError if it is no such file; the message has the line.
-    """
+    """The poses of a file.  Raises OSError if it cannot be read; ValueError if it is no such file; the message has the
+    line."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -212,9 +207,7 @@ class RecordedTracks:
 
     def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> tuple[Followed, ...]:
         """Return each body that did not fail, in their order, as its track knows it; ``file`` is the frame's source.
-
-        Raises FrameError for a frame without a pose, where there are poses.
-        """
+        Raises FrameError for a frame without a pose, where there are poses."""
         if self._poses is not None:
             pose = self._poses.of(file, frame)
             return self._session.follow(recovery.recovered, 0.0, pose, camera=frame.camera, depth=frame.depth)

@@ -30,8 +30,7 @@ from sq_perception.imaging.depth_units import Metres, Stated
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, edges_as_text
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
 
-CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
-"""Frame ids of images that bring none."""
+CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"  # frame ids of images that bring none
 
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 _CENTRE = slice(5, 8)
@@ -41,8 +40,7 @@ _OF_A_BODY = ("size", "shape", "translation", "rotation")
 _OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label", "objectness")
 """Columns of a message that are attributes of a recovery of the same name."""
 
-Mesh = tuple[np.ndarray, np.ndarray]
-"""Vertices (k, 3) and faces (m, 3) of vertex indices."""
+Mesh = tuple[np.ndarray, np.ndarray]  # vertices (k, 3) and faces (m, 3) of vertex indices
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +80,7 @@ def identify(
     recovery: FrameRecovery, tracks: Sequence[Followed] | None = None, hidden: tuple[int, ...] = ()
 ) -> Identified:
     """Return bodies and ids of their tracks, of which there is one for each body that did not fail, in their order.
-
-    Without tracks bodies are the frame's, and ids their labels.
-    """
+    Without tracks bodies are the frame's, and ids their labels."""
     if tracks is None:
         reasons = tuple(_reason(body, body.superquadric) for body in recovery.bodies)
         return Identified(recovery, tuple(body.label for body in recovery.bodies), columns={"reason": reasons})
@@ -241,10 +237,8 @@ def _join(meshes: Sequence[Mesh], array: SuperquadricArray) -> MarkerMesh:
 
 
 def covariances(array: SuperquadricArray) -> np.ndarray:
-    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown.
-
-    A message has no correlations, which sizes and centre of a fit have: a seen side is surer, a hidden one less sure.
-    """
+    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown.  A
+    message has no correlations, which sizes and centre of a fit have: a seen side is surer, a hidden one less sure."""
     found = np.zeros((len(array), 11, 11))
     deviations = [np.asarray(each, float) for each in (array.sigma_size, array.sigma_centre, array.sigma_turn)]
     size, centre, turn = (np.where(np.isfinite(each), each**2, np.nan) for each in deviations)

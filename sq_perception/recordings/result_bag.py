@@ -54,8 +54,7 @@ except ImportError as missing:
 
 BagImage = Literal["depth", "rendered", "labels"]
 SUFFIX = ".mcap"
-CHUNK_BYTES = 4 * 2**20
-"""Bytes of messages in a chunk: enough to pack well, little to lose."""
+CHUNK_BYTES = 4 * 2**20  # bytes of messages in a chunk: enough to pack well, little to lose
 SUPERQUADRICS, MARKERS = "/recover_node/superquadrics", "/recover_node/markers"
 RENDERED, LABELS, DEPTH = "/recover_node/rendered_depth", "/mask/image", "/depth/image"
 _SECOND = 10**9
@@ -95,12 +94,9 @@ class ResultBag:
         self.close(whole=kind is None)
 
     def add(self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None) -> None:
-        """Write a frame and what was recovered from it.
-
-        ``tracks``: of each body that did not fail, in their order; None if bodies are not tracked.  Raises FrameError
-        if a name in the recording is too long to be one; OSError if the disk is full; the file is then closed with what
-        there is.
-        """
+        """Write a frame, its recovery, and the ``tracks`` of the bodies that did not fail, None without tracking.
+        Raises FrameError for a name too long for a message; OSError if the disk is full, after which the file is
+        closed."""
         found = publication.identify(recovery, tracks)
         stamp = self._stamp(frame)
         received = frame.received if frame.received is not None else stamp.sec * _SECOND + stamp.nanosec
@@ -110,11 +106,8 @@ class ResultBag:
         self._frames, self._last = self._frames + 1, stamp
 
     def close(self, whole: bool = True) -> Path | None:
-        """Finish the file and give it its name; return where it is, None without a frame.
-
-        ``whole``: whether these are all frames that were to be; if not, a file that is there stays and this one is put
-        beside it.
-        """
+        """Finish the file and give it its name; return where it is, None without a frame.  If it is not ``whole``, a
+        file that is there stays and this one is put beside it."""
         if self._file.closed:
             return None
         if not self._frames:
@@ -188,10 +181,8 @@ class ResultBag:
 
 @cache
 def types(name: str) -> Callable[..., Any]:
-    """Return what makes messages of ``package/msg/Name`` from keywords; fields left out have ROS's defaults.
-
-    Raises KeyError for a type that ROS 2 Jazzy's common interfaces do not have.
-    """
+    """Return what makes messages of ``package/msg/Name`` from keywords; fields left out have ROS's defaults.  Raises
+    KeyError for a type that ROS 2 Jazzy's common interfaces do not have."""
     kind, defaults = _STORE.types[name], _defaults(name)
     return lambda **given: kind(**{**defaults, **given})
 

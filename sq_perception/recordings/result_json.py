@@ -32,10 +32,8 @@ from sq_perception.tracking.tracker import Track
 
 FORMAT = "sq_perception.recovery"
 VERSION = 1
-UNITS = {"optical": "m", "cube": "1"}
-"""Units of lengths, by a frame's coordinates."""
-LARGEST = 2**30
-"""Bytes of a file of lines that is resumed: some 10^5 frames."""
+UNITS = {"optical": "m", "cube": "1"}  # units of lengths, by a frame's coordinates
+LARGEST = 2**30  # bytes of a file of lines that is resumed: some 10^5 frames
 
 
 class ResumeError(ValueError):
@@ -191,11 +189,8 @@ def table(frames: Sequence[Mapping[str, Any]]) -> str:
 
 
 class ResultLines:
-    """A file of JSON lines that grows frame by frame; close it when all is done.  A stream is written to as it is.
-
-    ``done`` has the elements of ``frames`` that were there before.  Raises ResumeError if there is a file of something
-    else, or of other options; OSError if it cannot be written, or another program is writing it.
-    """
+    """A file of JSON lines that grows frame by frame, or a stream; ``done`` has the elements of ``frames`` that were
+    there.  Raises ResumeError for a file of something else or other options, OSError if it cannot be written."""
 
     def __init__(self, path: str | Path, options: Mapping[str, Any]) -> None:
         self._path = Path(path)

@@ -31,8 +31,7 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, triangles
 from sq_perception.geometry.superquadric import Superquadric
 
-SUFFIXES = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml", "curobo": ".yml"}
-"""Of the file of each format."""
+SUFFIXES = {"urdf": ".urdf", "sdf": ".sdf", "mjcf": ".xml", "curobo": ".yml"}  # of the file of each format
 CAPSULE, MESH = "capsule", "mesh"
 
 
@@ -75,9 +74,7 @@ def inflate(bodies: Superquadric, covariances: np.ndarray, sigmas: float) -> Sup
 
 def solids(bodies: Superquadric, form: str, *, names: Sequence[str] | None = None, meshes: bool = False) -> list[Solid]:
     """Return what encloses each of n bodies, in a format's kinds of solids; ``names``: body_0, body_1 ... by default.
-
-    Raises ValueError for a format that is none, or names that are not one a body and different.
-    """
+    Raises ValueError for a format that is none, or names that are not one a body and different."""
     if form not in SUFFIXES:
         raise ValueError(f"format: expected one of {', '.join(SUFFIXES)}, got {form!r}")
     names = [f"body_{k}" for k in range(len(bodies))] if names is None else list(names)

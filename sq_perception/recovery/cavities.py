@@ -33,21 +33,6 @@ if TYPE_CHECKING:
 _OPENING, _OUTERMOST = 0.7, 1.2
 """rho up to which a line of sight passes the opening, and of the outermost reading of a rim."""
 _SECTORS = 24
-_RIM_SECTORS = 0.7
-"""Share of the sectors in which there is a rim."""
-_OPEN_LINES = 0.3
-"""Share of the lines of sight through the opening that end well below it."""
-_LEAST_LINES = 12
-_LEAST_DEPTH, _DEPTH_SHARE = 0.008, 0.15
-"""Depth, metres and as a share of the opening's narrower half width, that is well below a rim."""
-_RIM_SPREAD = 0.005
-"""Height by which readings of one rim differ, metres, beside the noise."""
-_DEEPEST = 0.1
-"""Share of the lines through the opening that are the deepest."""
-_FLOOR = 0.75
-"""rho up to which the deepest readings are those of the floor."""
-_FACING = 0.15
-"""Cosine between the axis and the way to the camera from which on it sees into an opening."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +79,8 @@ def _cavities(fit: Fit, points: np.ndarray) -> Iterator[Cavity]:
         turn = body.rotation_matrix[:, order]
         if turn[:, 2] @ body.translation > 0:  # towards the camera, at the origin
             turn = turn * [1.0, -1.0, -1.0]
-        if -(turn[:, 2] @ body.translation) > _FACING * np.linalg.norm(body.translation):
+        # Cosine between the axis and the way to the camera from which on it sees into an opening.
+        if -(turn[:, 2] @ body.translation) > 0.15 * np.linalg.norm(body.translation):
             e2 = body.shape[1] if axis == 2 else body.shape[0]
             found = _at_end(points, body.translation, turn, body.size[order], float(e2), fit.noise)
             if found is not None:
@@ -107,7 +93,7 @@ def _at_end(
     """The cavity at the end of a body along the third axis of ``turn``, half sizes in the order of these axes."""
     eye, seen = -centre @ turn, (points - centre) @ turn
     noise = noise if math.isfinite(noise) else 0.0
-    spread = _RIM_SPREAD + noise
+    spread = 0.005 + noise  # metres by which the heights of readings of one rim differ
 
     def place(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         u, v = at[:, 0] / size[0], at[:, 1] / size[1]
@@ -121,17 +107,18 @@ def _at_end(
     if not np.isfinite(highest).any():
         return None
     level = float(np.median(highest[np.isfinite(highest)]))
-    if np.mean(np.abs(highest - level) < spread) < _RIM_SECTORS or eye[2] <= level:
+    # There is a rim in most of the sectors.
+    if np.mean(np.abs(highest - level) < spread) < 0.7 or eye[2] <= level:
         return None
     along = (eye[2] - level) / np.maximum(eye[2] - seen[:, 2], 1e-9)
     through, _ = place(eye + along[:, None] * (seen - eye))
     passes = through < _OPENING
     below = level - seen[passes, 2]
-    least = max(_LEAST_DEPTH, _DEPTH_SHARE * float(size[:2].min())) + noise
-    if len(below) < _LEAST_LINES or np.mean(below > least) < _OPEN_LINES:
+    least = max(0.008, 0.15 * float(size[:2].min())) + noise  # metres that are well below a rim
+    if len(below) < 12 or np.mean(below > least) < 0.3:
         return None
-    deepest = below >= np.quantile(below, 1 - _DEEPEST)
+    deepest = below >= np.quantile(below, 1 - 0.1)
     return Cavity(
         rim=centre + level * turn[:, 2], axis=turn[:, 2].copy(), half_widths=np.sort(size[:2]),
-        depth=float(np.median(below[deepest])), sees_floor=bool(np.median(rho[passes][deepest]) < _FLOOR),
+        depth=float(np.median(below[deepest])), sees_floor=bool(np.median(rho[passes][deepest]) < 0.75),
     )

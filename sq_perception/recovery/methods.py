@@ -63,11 +63,8 @@ def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitO
 
 
 def widen(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
-    """Return the fit of an object, unsure by how much farther it would reach if others were parts of it.
-
-    With the probability q that another is, and d by how much half sizes and centre of the box around both exceed those
-    of the body, second moments about the body grow by q d d^T: (1 - q) S + q (S + d d^T).
-    """
+    """Return a fit that is unsure by how much farther it would reach if others were parts of it: with the probability q
+    of each and d what the box around both adds to half sizes and centre, second moments grow by q d d^T."""
     if not np.isfinite(fit.covariance).all():
         return fit
     body, covariance = fit.superquadric, fit.covariance.copy()
@@ -86,19 +83,22 @@ def widen(fit: Fit, others: Iterable[tuple[float, SeenObject]]) -> Fit:
 
 
 def judge(likely: float, fit: Fit, pixels: float, larger: Iterable[tuple[float, Fit]]) -> float:
-    """The probability that an object is a thing once its body is known (:func:`objectness.posterior`).
-
-    ``larger`` are the affinity to each object with more pixels, and its fit; the surest of them may be the thing that
-    this one is a fragment of.
-    """
+    """The probability that an object is a thing once its body is known (:func:`objectness.posterior`); ``larger`` are
+    affinity and fit of objects with more pixels, of the surest of which it may be a fragment."""
     body, others = fit.superquadric, [(q, each) for q, each in larger if each.status != Status.FAILED]
     affinity, whole = max(others, key=lambda other: other[0], default=(0.0, None))
-    overlap = 0.0
-    if whole is not None:
-        eta, omega = np.meshgrid(np.linspace(-1.4, 1.4, 9), np.linspace(-np.pi, np.pi, 16, endpoint=False))
-        overlap = float((whole.superquadric.gauge(body.parametric_points(eta.ravel(), omega.ravel())) < 1).mean())
+    overlap = 0.0 if whole is None else _share_inside(body, whole.superquadric)
     uncertainty = float(np.max(fit.sigma_size / body.size))
     return objectness.posterior(likely, uncertainty, pixels, affinity, overlap)
+
+
+def _share_inside(body: Superquadric, other: Superquadric) -> float:
+    """The share of a body's surface, evenly in its angles, that lies inside of another."""
+    radii = sum(np.linalg.norm(each.size) * (1 + np.abs(each.taper).max()) for each in (body, other))
+    if np.linalg.norm(body.translation - other.translation) > radii:
+        return 0.0
+    eta, omega = np.meshgrid(np.linspace(-1.4, 1.4, 9), np.linspace(-np.pi, np.pi, 16, endpoint=False))
+    return float((other.gauge(body.parametric_points(eta.ravel(), omega.ravel())) < 1).mean())
 
 
 def _predict(obj: SeenObject) -> Fit:

@@ -60,10 +60,8 @@ class Weight(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What the image says of bodies in an object's place; pixels on a grid around it.
-
-    ``depth`` is NaN where nothing was measured, ``mask`` that of the object, ``sigma`` the noise, metres.
-    """
+    """What the image says of bodies in an object's place; pixels on a grid around it.  ``depth`` is NaN where nothing
+    was measured, ``mask`` that of the object, ``sigma`` the noise, metres."""
 
     depth: np.ndarray
     mask: np.ndarray

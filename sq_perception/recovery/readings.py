@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.imaging import depth_units, hole_filling, ranges
+from sq_perception.imaging import depth_units, hole_filling
 from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 from sq_perception.recovery.options import RecoveryOptions
 
@@ -39,18 +39,12 @@ class Readings:
 
     def doubt(self) -> str:
         """Return what makes all bodies of the image doubtful, in words; empty otherwise."""
-        if not self.camera.is_pinhole:
-            return ""
-        return depth_units.wrong_unit(self.depth) or (
-            ranges.RANGES if ranges.seem_ranges(self.depth, self.camera) else ""
-        )
+        return depth_units.doubt(self.depth, self.camera)
 
 
 def read(depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: RecoveryOptions) -> Readings:
-    """Check an image and fill its small holes; parameters and errors as those of ``Recoverer.recover``.
-
-    Arrays come out row by row, as kernels are compiled for arrays of a kind.
-    """
+    """Check an image and fill its small holes; parameters and errors as those of ``Recoverer.recover``.  Arrays come
+    out row by row, as kernels are compiled for arrays of a kind."""
     began = time.perf_counter()
     depth = camera.readings(depth)
     farthest = min(GREATEST_DEPTH, float(np.finfo(depth.dtype).max))  # which half precision does not reach

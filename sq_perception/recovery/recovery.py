@@ -150,10 +150,8 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
 
 
 def what_is_left_out(readings: Readings, found: FrameEvidence, bodies: int, fragments: int) -> list[str]:
-    """Return what was seen and is not among a number of bodies, and why, in words.
-
-    ``fragments`` is the number of objects that were left out by their bodies.
-    """
+    """Return what was seen and is not among a number of bodies, and why, in words.  ``fragments`` is the number of
+    objects that were left out by their bodies."""
     options, said = readings.options, []
     if not bodies:
         said.append(_why_empty(readings, found))

@@ -94,10 +94,8 @@ NOTHING = Repeated({}, None)
 
 
 class StillScene:
-    """Recovers the frames of one camera, and takes from the frame before, ``last``, what did not change.
-
-    Several scenes may share the ``recoverer``.
-    """
+    """Recovers the frames of one camera, and takes from the frame before, ``last``, what did not change.  Several
+    scenes may share the ``recoverer``."""
 
     def __init__(self, recoverer: Recoverer, last: Reference | None = None) -> None:
         self.recoverer = recoverer
@@ -143,10 +141,8 @@ def warm_up() -> None:
 
 
 def repeat(last: Reference, readings: Readings) -> Repeated:
-    """The bodies and segments of the frame before that hold for an image.
-
-    Segments repeat only where given masks do, or where none were given to either.
-    """
+    """The bodies and segments of the frame before that hold for an image.  Segments repeat only where given masks do,
+    or where none were given to either."""
     previous, camera, labels = last.recovery, readings.camera, readings.labels
     if last.camera != camera or last.options != readings.options or not camera.is_pinhole:
         return NOTHING
@@ -191,11 +187,8 @@ def repeat(last: Reference, readings: Readings) -> Repeated:
 def _compare(
     old: np.ndarray, new: np.ndarray, shown: np.ndarray, sigma: float
 ) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """What changed between two images (rows, columns), in levels of their noise; None where the camera has moved.
-
-    ``shown`` are the labels of the old one, and ``sigma`` is its noise at one metre.  Returns q (rows, columns),
-    clipped, what patches are taken of (rows, columns), the noise level s, and v.
-    """
+    """What changed between two images (rows, columns) of labels ``shown``, in levels of their noise; None where the
+    camera has moved.  Returns q, clipped, what patches are taken of, the noise level s, and v."""
     # A fourth behind the farthest object and beyond, where tables graze and walls are far, readings come and go.
     reach = 1.25 * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
@@ -209,10 +202,8 @@ def _compare(
 
 
 def match(kept: Repeated, labels: np.ndarray, found: Found) -> dict[int, Recovery]:
-    """The repeated bodies of a new frame's objects, by their new labels.
-
-    ``labels`` are those of the frame before; a body whose object is segmented otherwise now is left out.
-    """
+    """The repeated bodies of a new frame's objects, by their new labels.  ``labels`` are those of the frame before; a
+    body whose object is segmented otherwise now is left out."""
     same: dict[int, Recovery] = {}
     for obj in found.objects if kept.bodies else ():
         is_own = (found.segmentation.labels[obj.window] == obj.label) & np.isfinite(obj.depth_crop)
@@ -228,10 +219,8 @@ def match(kept: Repeated, labels: np.ndarray, found: Found) -> dict[int, Recover
 
 
 def sample(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
-    """The readings of an image (height, width) that are compared, float32, and their stride in pixels.
-
-    The image is NaN where nothing was measured, the readings are 0 there.
-    """
+    """The readings of an image (height, width) that are compared, float32, and their stride in pixels.  The image is
+    NaN where nothing was measured, the readings are 0 there."""
     stride = max(1, round(camera.width / 320))  # with so many columns neighbouring noise is alike in all sensors
     seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
     return np.where(np.isnan(seen), np.float32(0), seen), stride
@@ -280,10 +269,8 @@ def _changed(old: np.ndarray, new: np.ndarray, reach: float) -> tuple[np.ndarray
 def _in_noise_levels(
     change: np.ndarray, old: np.ndarray, new: np.ndarray, level: float, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What patches are taken of (rows, columns), and sizes (n,) of the sums of q over blocks of readings.
-
-    ``change`` becomes q, clipped, in place.
-    """
+    """What patches are taken of (rows, columns), and sizes (n,) of the sums of q over blocks of readings.  ``change``
+    becomes q, clipped, in place."""
     patches = np.empty(change.shape, np.float32)
     for v in range(change.shape[0]):
         for u in range(change.shape[1]):

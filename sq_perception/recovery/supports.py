@@ -25,16 +25,7 @@ from sq_perception.segmentation.evidence import FrameEvidence
 from sq_perception.segmentation.options import SegmentationOptions, across
 from sq_perception.segmentation.support_plane import TOLERANCE
 
-_HOVERING = 0.02
-"""An object this many metres above its plane, by its lowest points, may stand on another surface."""
-_HIGHEST_STACK = 0.5
-"""Higher above its plane, metres, an object does not even stand on others that stand on it."""
-_FEET = 0.01
-"""Metres above the lowest pixels that are an object's feet."""
-_NOT_ON_IT = 0.1
-"""Metres above its plane from which on what is beside an object may hold it."""
-_HELD = 0.15
-"""Share of what is beside an object from which on it is held by what is of no object, and not on the plane either."""
+_HOVERING = 0.02  # an object this many metres above its plane, by its lowest points, may stand on another surface
 
 
 def support(
@@ -71,9 +62,10 @@ def support(
         lowest, middle = obj.levels(other.equation)
         if abs(lowest) < _HOVERING and middle > 0:
             return other.equation
-    if behind or low < -reach or low > _HIGHEST_STACK:
+    # Higher above its plane an object does not even stand on others that stand on it.
+    if behind or low < -reach or low > 0.5:
         return None
-    is_held = low > _NOT_ON_IT and _is_held(obj, low, depth, camera, found.labels, found.plane)
+    is_held = low > 0.1 and _is_held(obj, low, depth, camera, found.labels, found.plane)
     return None if is_held else found.plane
 
 
@@ -89,7 +81,7 @@ def _is_held(
     beside = outer > inner
     seen = beside & (names == 0) & (near < quantile(obj.depth_crop[obj.mask_crop], 0.5) + obj.step)
     above = raycast.heights(near, seen, view.lens, plane) > low
-    return bool(np.count_nonzero(above) > _HELD * np.count_nonzero(beside))
+    return bool(np.count_nonzero(above) > 0.15 * np.count_nonzero(beside))
 
 
 def _reach(obj: SeenObject) -> float:
@@ -105,7 +97,7 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
     reach = _reach(obj)
     axes, best = across(plane[:3]), 0.0
     points = obj.points
-    feet = (points[points @ plane[:3] + plane[3] < low + _FEET] @ axes).astype(np.float32)
+    feet = (points[points @ plane[:3] + plane[3] < low + 0.01] @ axes).astype(np.float32)  # within a centimetre
     for other in near:
         points = other.points
         heights = points @ plane[:3] + plane[3]

@@ -51,10 +51,8 @@ class WorkerLostError(RuntimeError):
 def recover_all(
     frames: Iterable[tuple[_Key, Work | None]], executor: Processes
 ) -> Iterator[tuple[_Key, FrameRecovery | Exception | None]]:
-    """The key of each frame, in their order, with its recovery or the exception that it raised, None for no work.
-
-    An answer may be a :class:`WorkerLostError`.  The executor is shut down in the end.
-    """
+    """The key of each frame, in their order, with its recovery or the exception that it raised, None for no work.  An
+    answer may be a :class:`WorkerLostError`.  The executor is shut down in the end."""
     under_way: deque[tuple[_Key, Work | None, _Answer]] = deque()
 
     def begun(work: Work | None) -> _Answer:

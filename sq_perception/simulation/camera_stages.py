@@ -144,11 +144,8 @@ def fill(depth: np.ndarray, rule: Filling) -> np.ndarray:
 
 
 def align(depth: np.ndarray, camera: Camera, beside: np.ndarray, onto: Camera, whole: bool) -> np.ndarray:
-    """The depth that a camera ``onto`` has of one that ``camera`` measured.
-
-    ``beside`` (3,) is where ``camera`` is in the frame of ``onto``, metres; they look in parallel.  ``whole`` pixels
-    are drawn as rectangles, else as points, which leave gaps where ``onto`` has the finer image.
-    """
+    """The depth that a camera ``onto`` has of one that ``camera`` measured at ``beside`` (3,) in its frame, metres,
+    looking in parallel; drawn as rectangles, ``whole``, or as points, which leave gaps in finer images."""
     out = np.full((onto.height, onto.width), np.float32(np.inf))
     _draw(depth, camera.lens, np.asarray(beside, dtype=float), out, onto.lens, 0.5 if whole else 0.0)
     out[np.isinf(out)] = np.nan
@@ -173,11 +170,8 @@ def round_depth(depth: np.ndarray, step: float) -> np.ndarray:
 
 
 def blocks(depth: np.ndarray, quantum: float) -> np.ndarray:
-    """The depth after a lossy compression whose blocks' means have this ``quantum``, per metre.
-
-    The steps of waves grow with their frequency, (1 + i + j) quantum, as those of JPEG do about.  Missing readings are
-    0 in the image that is compressed, and known to be missing afterwards, as a mask goes with it.
-    """
+    """The depth after a lossy compression whose blocks' means have this ``quantum``, per metre, and waves about (1 + i
+    + j) of it, as in JPEG.  Missing readings are 0 in the image, and known as a mask goes with it."""
     side = 8  # side of JPEG's blocks, pixels
     height, width = depth.shape
     w = np.nan_to_num(_inverse(depth), nan=0.0)

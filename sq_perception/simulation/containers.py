@@ -156,10 +156,8 @@ def _revolve(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0) 
 
 
 def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
-    """Return the widest of some superquadrics at the rim that stays within a stack of slabs; none if it is narrow.
-
-    At the height z a superquadric of the half height h has the radius a (1 - |z / h|^(2 / e1))^(e1 / 2).
-    """
+    """Return the widest of some superquadrics at the rim that stays within a stack of slabs; none if it is narrow.  At
+    the height z a superquadric of the half height h has the radius a (1 - |z / h|^(2 / e1))^(e1 / 2)."""
     count = len(radii)
     z = np.linspace(wall, height, 100, endpoint=False)
     up = (z[:, None] - height * (np.arange(count) + 0.5) / count) / (_OVERLAP * height / count)

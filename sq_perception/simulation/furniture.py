@@ -135,12 +135,8 @@ KINDS = tuple(_KINDS)
 
 
 def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:
-    """Draw objects in or on a piece of furniture, one of ``KINDS``; hidden ones are left out.
-
-    ``plane`` is the one that they stand on.
-
-    Raises ValueError if the objects do not fit into the camera's image, or the furniture always hides all of them.
-    """
+    """Draw objects in or on a piece of furniture, one of ``KINDS``, without hidden ones; they stand on ``plane``.
+    Raises ValueError if they do not fit into the image, or the furniture always hides all of them."""
     kind = _KINDS[name]
     for _ in range(20):
         scene = things_on_table(rng, int(rng.integers(1, kind.most + 1)), camera, kind.elevation)

@@ -1,4 +1,4 @@
-"""Scenes with known truth: one body of the thesis' protocol, or bodies resting on a table.
+"""Scenes with known truth: one body of the thesis' protocol, bodies resting on a table, or a sample of known objects.
 
 Thesis protocol (chapter 5.1), in the unit cube: half sizes a in [25, 75] / 255, exponents e in [0.1, 1], the centre at
 (128 +- 40) / 255, rotations uniform, seen by the orthographic camera of :mod:`sq_perception.imaging.unit_cube`.
@@ -31,11 +31,11 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
+from sq_perception.simulation.sensor_noise import preset
 
 THESIS_SIZE = (25 / 255, 75 / 255)
 TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-MOST = 12
-"""Most bodies of a crowd."""
+MOST = 12  # most bodies of a crowd
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,8 @@ def thesis_scene(rng: np.random.Generator) -> Scene:
 
 
 def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:
-    """Draw ``count`` random bodies side by side on a table, all wholly inside the image.
-
-    Raises ValueError if ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its
-    image.
-    """
+    """Draw ``count`` random bodies side by side on a table, all wholly inside the image.  Raises ValueError if
+    ``count`` is not 1 to 10, the camera is no pinhole camera, or the bodies do not fit into its image."""
     if not 1 <= count <= 10:
         raise ValueError(f"count: expected 1 to 10 bodies, got {count}")
     if not camera.is_pinhole:
@@ -156,10 +153,8 @@ def inside_image(body: Superquadric, camera: Camera, border: float = 0.0) -> boo
 
 
 def draw_crowd(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
-    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.
-
-    Raises ValueError if ``count`` is not 1 to 12, or the bodies do not fit into the image.
-    """
+    """Draw ``count`` random bodies on a table seen from 0.5 to 1.2 m, most in contact, wholly inside the image.  Raises
+    ValueError if ``count`` is not 1 to 12, or the bodies do not fit into the image."""
     if not 1 <= count <= MOST:
         raise ValueError(f"count: expected 1 to {MOST} bodies, got {count}")
     for _ in range(10):
@@ -208,3 +203,42 @@ def _push(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
         middle = 0.5 * (near + far)
         near, far = (middle, far) if body.move(middle * way).overlaps(other) else (near, middle)
     return body.move(far * way)
+
+
+THINGS = {
+    "carton": ((0.16, 0.07, 0.21), (0.1, 0.1), (-0.15, 0.10), 20.0),
+    "can": ((0.066, 0.066, 0.115), (0.1, 1.0), (0.04, 0.02), 0.0),
+    "ball": ((0.074, 0.074, 0.074), (1.0, 1.0), (0.17, -0.06), 0.0),
+    "soap": ((0.095, 0.060, 0.035), (0.3, 0.3), (-0.06, -0.11), -35.0),
+}
+"""The sample's objects: full edges, exponents, place on the table (x to the right, y away from the camera) and turn, in
+metres and degrees."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """A simulated frame: measured depth (height, width), metres, NaN where nothing was measured, its camera, and the
+    true bodies (n,) in the optical frame with their names."""
+
+    depth: np.ndarray
+    camera: Camera
+    bodies: Superquadric
+    names: tuple[str, ...]
+
+
+def sample(seed: int = 0) -> Sample:
+    """Simulate a table as a RealSense D435 measures it from 0.85 m, 35 degrees above, with the noise of this seed."""
+    pitch = np.deg2rad(35.0)
+    up = np.array([0.0, -np.cos(pitch), -np.sin(pitch)])
+    right = np.array([1.0, 0.0, 0.0])
+    table = np.stack([right, np.cross(up, right), up], axis=1)
+    looked_at = np.array([0.0, 0.0, 0.85])
+    bodies = []
+    for edges, shape, place, degrees in THINGS.values():
+        size = 0.5 * np.array(edges)
+        centre = looked_at + table @ np.array([*place, size[2]])
+        turn = quaternions.from_matrix(table @ turn_about_up(np.deg2rad(degrees)))
+        bodies.append(Superquadric(size, np.array(shape), centre, turn))
+    scene = Scene(Superquadric.stack(bodies), TABLE_CAMERA, np.append(up, -up @ looked_at))
+    depth = preset("realsense_d435").measure(scene.render()[0], scene.camera, np.random.default_rng(seed))
+    return Sample(depth.astype(np.float32), scene.camera, scene.bodies, tuple(THINGS))

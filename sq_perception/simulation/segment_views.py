@@ -117,8 +117,11 @@ def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.n
     found = segments.segment(measured.depth, measured.camera)
     for label in found.ids:
         view = measured.view(found.labels, label, found.plane)
-        shown = measured.shown[found.labels == label]
-        yield view.image, _truth(*measured.in_cells(view), _object(shown))
+        counts = np.bincount(measured.shown[found.labels == label], minlength=2)
+        thing = int(counts[1:].argmax()) + 1
+        if counts[0] >= 0.5 * counts.sum() and counts[thing] <= 0.3 * counts.sum():
+            thing = _NO_OBJECT
+        yield view.image, _truth(*measured.in_cells(view), thing)
         yield from _views_of_pieces(view, measured, rng)
         yield from _views_of_merged(label, found, measured, rng)
 
@@ -181,14 +184,6 @@ def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
     first = np.rint(middle + (rng.uniform(-0.5, 0.5, 2) - 0.5) * size).astype(int)
     top, left = np.clip(first, 0, np.array([height, width]) - size)
     return slice(int(top), int(top + size[0])), slice(int(left), int(left + size[1]))
-
-
-def _object(shown: np.ndarray) -> int:
-    """Return the object that most of a segment's pixels show, ``_NO_OBJECT`` if they show none."""
-    counts = np.bincount(shown, minlength=2)
-    most, total = int(counts[1:].argmax()) + 1, counts.sum()
-    has_none = counts[0] >= 0.5 * total and counts[most] <= 0.3 * total
-    return _NO_OBJECT if has_none else most
 
 
 def _truth(cells: np.ndarray, known: np.ndarray, thing: int) -> np.ndarray:

@@ -60,15 +60,9 @@ class SensorNoise(ABC):
     """A depth sensor; see the module."""
 
     def measure(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
-        """Measure a true depth image: float32 (height, width) metres, NaN for no reading.
-
-        depth: floating (height, width), true depth in metres, +inf or NaN where nothing is seen.
-        camera: Of the image; a pinhole for all sensors but :class:`Ideal`.
-        rng: The same state gives the same image.
-
-        Raises ValueError or TypeError if the image is not of floating numbers or not of the camera's size, shows depths
-        that are not positive to a pinhole camera, or the camera or the generator are of another kind.
-        """
+        """Measure a true depth image (height, width), metres, +inf or NaN for nothing: float32, NaN for no reading.
+        Raises ValueError or TypeError for other numbers, sizes, depths or cameras; only :class:`Ideal` takes
+        orthographic ones."""
         if not isinstance(rng, np.random.Generator):
             raise TypeError(f"rng: expected a numpy.random.Generator, got {type(rng).__name__}")
         depth = np.asarray(depth)
@@ -79,9 +73,7 @@ class SensorNoise(ABC):
 
     def sigma(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
         """Return the standard deviation, metres, of a reading at depth z with this cosine of incidence; broadcasts.
-
-        Raises ValueError if a depth is not positive or a cosine not in (0, 1].
-        """
+        Raises ValueError if a depth is not positive or a cosine not in (0, 1]."""
         z, cosine = np.asarray(z, dtype=float), np.asarray(cosine, dtype=float)
         if not (np.isfinite(z) & (z > 0)).all():
             raise ValueError("z: expected positive metres")
@@ -335,8 +327,7 @@ def _average(rng: np.random.Generator, shape: tuple[int, ...], window: tuple[int
     return mean[top : top + shape[0], left : left + shape[1]] / np.float32(np.sqrt(columns * rows))
 
 
-IDEAL = "ideal"
-"""Name of the sensor with Gaussian noise and nothing else, whose noise the user chooses."""
+IDEAL = "ideal"  # name of the sensor with Gaussian noise and nothing else, whose noise the user chooses
 PRESETS: Mapping[str, SensorNoise] = {
     # Kinect for Xbox 360, Xtion and their kin, in the infrared camera's own view.  Noise and edges: Nguyen et al.
     # Steps and range: Khoshelham & Elberink (2.85 mm at 1 m, which is 1/8 pixel; 0.5 to 5 m).  Window: autocorrelation

@@ -29,8 +29,7 @@ from sq_perception.geometry.union import flat_support, support_of_union
 from sq_perception.simulation.rendering import Mesh
 
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
-"""The object's x axis points up: it lies on a side."""
+ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])  # the object's x axis points up: it lies on a side
 ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """The object's y axis, of an oval bottle the shorter one, points up."""
 INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
@@ -43,8 +42,7 @@ ROUND_RESTS = (("standing", UPRIGHT, 0.78), ("lying", ON_Y, 0.19), ("inverted", 
 OVAL_RESTS = (("standing", UPRIGHT, 0.75), ("lying", ON_Y, 0.2), ("on its side", ON_X, 0.05))
 
 Numbers = Sequence[float] | np.ndarray
-Row = tuple[float, ...]
-"""A part: a1 a2 a3 e1 e2 x y z qx qy qz qw."""
+Row = tuple[float, ...]  # a part: a1 a2 a3 e1 e2 x y z qx qy qz qw
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +77,7 @@ class Thing:
 
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
         """Draw a resting pose, turned about the vertical: its name and the quaternion (4,) to a frame with z up.
-
-        ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them.
-        """
+        ``leaning`` is the share of objects that are tilted by 4 to 35 degrees, as by something under or beside them."""
         rest = self.rests[draw_index([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
         if rng.random() < leaning:
@@ -139,11 +135,8 @@ SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
-    """Read all meshes of a folder, by name.
-
-    Raises ValueError if there are none, one cannot be read or has no faces, or its size is none that one takes in a
-    hand.
-    """
+    """Read all meshes of a folder, by name.  Raises ValueError if there are none, one cannot be read or has no faces,
+    or its size is none that one takes in a hand."""
     paths = sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in SUFFIXES)
     if not paths:
         raise ValueError(f"{folder}: expected meshes ({' '.join(SUFFIXES)}), found none")

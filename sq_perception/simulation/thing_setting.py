@@ -102,11 +102,8 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
 def _camera_pose(
     parts: np.ndarray, reach: np.ndarray, lift: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Draw the optical from table pose, a quaternion (4,) and a translation (3,), and the object's distance.
-
-    The object's parts (k, 12) are in its own frame, ``reach`` (6,) is its support in SIX_WAYS there, and ``lift`` (3,)
-    leads to the table's frame.
-    """
+    """Draw the optical from table pose, quaternion (4,) and translation (3,), and the distance of parts (k, 12) with
+    the support ``reach`` (6,) in SIX_WAYS; ``lift`` (3,) leads to the table's frame."""
     # Of a network that saw 0.5 % from above 80 degrees the hulls there erred half as much again as those at 20 to 70.
     elevations = (20.0, 70.0), (65.0, 90.0), (3.0, 25.0)
     elevation = np.deg2rad(rng.uniform(*rng.choice(elevations, p=(0.55, 0.25, 0.2))))
@@ -140,10 +137,8 @@ def optical_from_table(pitch: float, roll: float) -> np.ndarray:
 
 
 def _pitch(ray: np.ndarray, elevation: float, roll: float) -> float:
-    """Return the pitch, radians, of a camera whose ray meets the table at ``elevation``, or as steeply as it can.
-
-    With r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation).
-    """
+    """Return the pitch, radians, of a camera whose ray meets the table at ``elevation``, or as steeply as it can.  With
+    r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation)."""
     x, y, z = ray / np.linalg.norm(ray)
     y = np.cos(roll) * y - np.sin(roll) * x
     return float(np.arcsin(min(np.sin(elevation) / np.hypot(y, z), 1.0)) - np.arctan2(y, z))

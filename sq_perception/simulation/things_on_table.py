@@ -33,11 +33,9 @@ from sq_perception.simulation.thing import SIX_WAYS, Thing
 from sq_perception.simulation.thing_setting import level_directions, optical_from_table
 
 MOST_THINGS = 8
-TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
-"""VGA, 60 degrees wide."""
+TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)  # VGA, 60 degrees wide
 
-ELEVATION = (20.0, 70.0)
-"""Degrees."""
+ELEVATION = (20.0, 70.0)  # degrees
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many an object can neither lean nor be stacked where it is tried."""
 _UP = 128
@@ -112,13 +110,9 @@ def things_on_table(
     rng: np.random.Generator, count: int | None = None, camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION, kinds: Sequence[str] | None = None,
 ) -> ThingsOnTable:
-    """Place ``count`` objects, or 1 to 8, of some kinds or of any, on a table, all wholly inside the image.
-
-    The camera is ``elevation`` (least, greatest) degrees above the table.
-
-    Raises ValueError if ``count`` is not 1 to 8, the camera is no pinhole camera, or the objects do not fit into its
-    image.
-    """
+    """Place ``count`` objects, or 1 to 8, of some kinds or any, on a table, all inside the image of a camera
+    ``elevation`` (least, greatest) degrees above it.  Raises ValueError for a wrong count or camera, or if they do not
+    fit."""
     if count is not None and not 1 <= count <= MOST_THINGS:
         raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
     if not camera.is_pinhole:

@@ -52,8 +52,7 @@ from sq_perception.geometry.kernels import inline_kernel, kernel, support
 from sq_perception.tracking import state
 from sq_perception.tracking.state import CENTRE, HAND, LENGTH, SHAPE, SIZE, SIZE_AND_SHAPE, TURN
 
-DEEP = 0.5
-"""D over both supports, 1 where bodies touch, below which they are in one place: no two things are.  Chosen."""
+DEEP = 0.5  # d over both supports, 1 where bodies touch, below which they are in one place: no two things are.  Chosen.
 
 
 class Pairs(NamedTuple):
@@ -79,10 +78,8 @@ class Pairs(NamedTuple):
 def pairs_in_place(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> Pairs:
-    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap.
-
-    Covariances are (n, 11, 11) and (m, 11, 11); an error that observations have beside theirs is part of the tracks'.
-    """
+    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap.  Covariances are (n, 11, 11) and (m, 11, 11);
+    an error that observations have beside theirs is part of the tracks'."""
     distance = separation(track, observed)
     between = observed[None, :, 5:8] - track[:, None, 5:8]
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
@@ -159,11 +156,8 @@ def _assign(
 
 @kernel
 def cheapest(cost: np.ndarray) -> np.ndarray:
-    """The pairs of rows and columns with the least sum of costs (n, m), n <= m, each row in one: (n, m), bool.
-
-    The Hungarian method with potentials: row after row takes the end of its shortest alternating path to a free column
-    (Kuhn 1955, Jonker and Volgenant 1987).  Row 0 and column 0 stand for none.
-    """
+    """The pairs with the least sum of costs (n, m), n <= m, each row in one: (n, m), bool.  The Hungarian method with
+    potentials and shortest paths (Kuhn 1955, Jonker and Volgenant 1987); row 0 and column 0 stand for none."""
     rows, columns = cost.shape
     of_rows, of_columns = np.zeros(rows + 1), np.zeros(columns + 1)  # potentials
     row_of = np.zeros(columns + 1, dtype=np.int64)
@@ -243,8 +237,7 @@ def _rotations() -> np.ndarray:
 
 
 TURNS = _rotations()
-EXACT = 8
-"""The number of rotations that describe the same body."""
+EXACT = 8  # the number of rotations that describe the same body
 _QUATERNIONS = quaternions.from_matrix(TURNS)
 _CHANGES = np.zeros((len(TURNS), LENGTH, LENGTH))  # what the renaming of axes makes of an error
 _CHANGES[:, range(3, 8), range(3, 8)] = 1
@@ -287,10 +280,8 @@ def loosen_pose(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
 def rename_axes(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """An observation (12,) that its track does not follow, and its covariance, with the axes named as the track's.
-
-    The rotation about an axis that the observation leaves open, as of something round, is the track's.
-    """
+    """An observation (12,) that its track does not follow, and its covariance, with the axes named as the track's.  The
+    rotation about an axis that the observation leaves open, as of something round, is the track's."""
     distance = np.linalg.norm(observed[None, 5:8] - track[5:8], axis=-1)
     free = loosen_pose(track_covariance[None], distance)
     (form,), (changed,) = nearest_form(track[None], free, observed[None], covariance[None])

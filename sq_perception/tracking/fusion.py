@@ -39,8 +39,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state as states
 from sq_perception.tracking.state import CENTRE, LENGTH, TURN
 
-VIEWS = 16
-"""Directions that are kept for each body: two thirds of a circle at VIEW_ANGLE."""
+VIEWS = 16  # directions that are kept for each body: two thirds of a circle at VIEW_ANGLE
 
 
 class Estimate(NamedTuple):
@@ -79,11 +78,8 @@ class Estimate(NamedTuple):
 
 
 class Observation(NamedTuple):
-    """n observations in the forms of their tracks, world frame.
-
-    ``white``, ``common`` and ``shared`` (n, 11, 11) are the covariances W, B and gamma R, ``direction`` (n, 3) leads
-    from the body to the camera.
-    """
+    """n observations in the forms of their tracks, world frame.  ``white``, ``common`` and ``shared`` (n, 11, 11) are
+    the covariances W, B and gamma R, ``direction`` (n, 3) leads from the body to the camera."""
 
     state: np.ndarray
     white: np.ndarray
@@ -93,11 +89,8 @@ class Observation(NamedTuple):
 
 
 def update(track: Estimate, seen: Observation, turning: np.ndarray) -> Estimate:
-    """n tracks after one observation each.
-
-    ``turning`` (n,) are bodies that have rotated themselves.  What rotates the estimate of a resting body is a
-    correction: it was seen from the same directions of the world.  A body that rotated shows another side.
-    """
+    """n tracks after one observation each.  ``turning`` (n,) are bodies that have rotated themselves, and so show
+    another side; what rotates the estimate of a resting one is a correction, from the same directions of the world."""
     row = np.arange(len(track.state))
     error = states.difference(track.state, seen.state)
     has_turned = turning[:, None] & (_variances(seen.white + seen.common)[:, TURN] < states.DETERMINED**2)

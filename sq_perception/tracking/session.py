@@ -94,15 +94,12 @@ class TrackingSession:
         self, observed: Sequence[Observed], stamp: float, camera_pose: object = None, *, is_pose_known: bool = True,
         camera: Camera | None = None, depth: np.ndarray | None = None,
     ) -> tuple[Followed, ...]:
-        """The bodies of another frame, in the order of ``observed``.
+        """The bodies of another frame, in the order of ``observed``: without failed ones, in the optical frame.  A
+        ``stamp`` before the last one, seconds, resets the session.  Of a pose that is not known ``camera_pose`` is not
+        looked at.
 
-        observed: Bodies in the optical frame, without failed ones.
-        stamp: Seconds; a stamp before the last one resets the session.
-        camera_pose: Camera in the world, as in :meth:`Tracker.update`; None: the camera is the world.
-        is_pose_known: False for a frame whose pose was wanted and is not known; ``camera_pose`` is then not looked at.
-        camera, depth: As in :meth:`Tracker.update`.
-
-        Raises ValueError as :meth:`Tracker.update`; nothing has changed then, unless the stamp is before the last one.
+        Other arguments and errors are those of :meth:`Tracker.update`; after an error nothing has changed, but for a
+        reset.
         """
         rotation, position = state.parse_pose(camera_pose) if is_pose_known else self._pose
         is_back = stamp < self._stamp

@@ -21,8 +21,7 @@ from sq_perception.geometry.superquadric import Superquadric
 LENGTH = 11
 SIZE, SHAPE, CENTRE, TURN = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11)
 SIZE_AND_SHAPE, POSE = slice(0, 5), slice(5, 11)
-HAND = 1.0
-"""Metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down."""
+HAND = 1.0  # metres, and radians, that a hand moves a thing in a second at most.  Chosen: it sets things down.
 DETERMINED = 0.2
 """Standard deviation in radians up to which a rotation about an axis counts as measured.  Chosen: three of them stay
 below the 45 degrees at which another axis of the body is nearer."""
@@ -95,9 +94,7 @@ def diagonal(size: float, shape: float, centre: float, turn: float) -> np.ndarra
 
 def parse_pose(pose: object) -> tuple[np.ndarray, np.ndarray]:
     """Rotation (4,), a quaternion x y z w, and translation (3,) of a 4 x 4 matrix or a pair of them; None: identity.
-
-    Raises ValueError for anything else, numbers that are not finite, or a matrix that is no rigid motion.
-    """
+    Raises ValueError for anything else, numbers that are not finite, or a matrix that is no rigid motion."""
     if pose is None:
         return np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
     if isinstance(pose, tuple | list) and len(pose) == 2:

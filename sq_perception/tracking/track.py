@@ -18,19 +18,15 @@ from sq_perception.tracking.state import CENTRE, HAND, LENGTH, POSE, TURN
 
 DRIFT = states.diagonal(0.0, 0.0, 0.001, 0.01)
 """Random walk of a body at rest in a second: a millimetre, and 0.6 degrees.  Chosen."""
-CONFIRM_AFTER = 3
-"""Observations until a track is confirmed: one more than may disagree by chance.  Chosen."""
+CONFIRM_AFTER = 3  # observations until a track is confirmed: one more than may disagree by chance.  Chosen.
 
 
 class TrackState(Enum):
     """How far a track is known."""
 
-    TENTATIVE = "tentative"
-    """Observed in this frame, not often yet."""
-    CONFIRMED = "confirmed"
-    """Observed in this frame, and often enough."""
-    LOST = "lost"
-    """Not observed in this frame: hidden, missed or gone."""
+    TENTATIVE = "tentative"  # observed in this frame, not often yet
+    CONFIRMED = "confirmed"  # observed in this frame, and often enough
+    LOST = "lost"  # not observed in this frame: hidden, missed or gone
 
 
 @dataclass(frozen=True, eq=False)

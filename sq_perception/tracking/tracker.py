@@ -37,14 +37,12 @@ __all__ = ["Track", "TrackState", "Tracker"]
 COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
 """rho and gamma, the shares of an observation's covariance that views from one direction, and all views, have in
 common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
-PREDICTED_SHARE = 0.6
-"""gamma of bodies beside a predicted hull, which errs alike in all frames."""
+PREDICTED_SHARE = 0.6  # gamma of bodies beside a predicted hull, which errs alike in all frames
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
-FORGET_AFTER = 30.0
-"""Seconds without observation until a body is given up.  Chosen."""
+FORGET_AFTER = 30.0  # seconds without observation until a body is given up.  Chosen.
 MOST = 100
 """Tracks that are kept; beyond them those die first that were not observed for longest.  Bounds the time of a frame."""
 _Bodies = tuple[Body, ...]
@@ -75,10 +73,8 @@ class _Frame(NamedTuple):
 
 
 class Tracker:
-    """Follows bodies; one call of :meth:`update` for each frame.
-
-    What it knows between two frames is frozen: a copy of it goes on by itself.
-    """
+    """Follows bodies; one call of :meth:`update` for each frame.  What it knows between two frames is frozen: a copy of
+    it goes on by itself."""
 
     def __init__(self) -> None:
         self._bodies: _Bodies = ()
@@ -204,11 +200,8 @@ def _count_jumps(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
 
 
 def _see_again(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> tuple[_Bodies, Pairs]:
-    """The bodies after answers that repeat earlier ones, and the pairs that are left to be fused.
-
-    A repeated answer is fused all the same if the body moves or was found elsewhere, or if it disagrees with the track,
-    as after a correction of the camera's pose.
-    """
+    """The bodies after answers that repeat earlier ones, and the pairs left to be fused: those of bodies that move,
+    were found elsewhere, or disagree, as after a correction of the camera's pose."""
     if not frame.repeats[pairs.observed].any():
         return bodies, pairs
     agrees = _compare(bodies, pairs)[2].agrees
@@ -249,11 +242,8 @@ def _fuse(bodies: _Bodies, pairs: Pairs, frame: _Frame) -> _Bodies:
 def _doubt(
     bodies: _Bodies, pairs: Pairs, covariances: np.ndarray, white: np.ndarray, whole: np.ndarray, stamp: float
 ) -> tuple[list[Body], np.ndarray]:
-    """The bodies of pairs with what their observations show of motion and doubt, and which of them turn, bool (n,).
-
-    Where an observation disagrees with its track, the covariances (n, 11, 11) of the tracks and the ``white`` ones of
-    the observations grow, in place; ``whole`` (n, 11, 11) are the observations' with the least error.
-    """
+    """The bodies of pairs with what observations show of motion and doubt, and which turn, bool (n,).  Where one
+    disagrees, the tracks' covariances and its ``white`` one grow, in place; ``whole`` are with the least error."""
     some = [bodies[k] for k in pairs.track]
     total, error, verdict = _compare(bodies, pairs)
     turning = np.zeros(len(some), dtype=bool)

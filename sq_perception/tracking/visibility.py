@@ -23,9 +23,7 @@ def is_missing(
     states: np.ndarray, camera: Camera | None, depth: np.ndarray | None, rotation: np.ndarray, position: np.ndarray
 ) -> np.ndarray:
     """Whether bodies (n, 12), seen by a camera with this pose in the world, are not where they should be, bool (n,).
-
-    The camera sees through most of the near side that it could see.  Without camera or depth image all are missing.
-    """
+    The camera sees through most of the near side that it could see.  Without camera or depth image all are missing."""
     if camera is None or depth is None or not len(states):
         return np.ones(len(states), dtype=bool)
     back = quaternions.conjugate(rotation)

@@ -8,7 +8,6 @@ from python_process import run_python
 
 from sq_perception import Camera, Recoverer, Superquadric
 from sq_perception.evaluation import plots
-from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.recovery_figure import recovery_figure
 from sq_perception.geometry.mesh import outline
 from sq_perception.grasping.gripper import PANDA
@@ -105,7 +104,7 @@ def test_a_view_from_the_camera_s_side_looks_like_the_image():
 
     def middle(azimuth):
         figure, ax = one_picture((4, 4))
-        draw_bodies_3d(ax, [left, right], colours=[red, blue], elevation=0, azimuth=azimuth)
+        plots.draw_bodies_3d(ax, [left, right], colours=[red, blue], elevation=0, azimuth=azimuth)
         picture = drawn(figure)
         difference = picture[..., 0] - picture[..., 2]
         return np.nonzero(difference > 60)[1], np.nonzero(difference < -60)[1]
@@ -147,10 +146,10 @@ def test_draw_on_a_plane_with_points_and_true_wires():
     figure, ax = one_picture((4, 4))
     depth, labels = shot()
     v, u = np.nonzero(labels)
-    draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=list(outline(BODY)))
+    plots.draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=list(outline(BODY)))
     assert drawn(figure).std() > 20
     empty, ax = one_picture((2, 2))
-    draw_bodies_3d(ax, [])
+    plots.draw_bodies_3d(ax, [])
     assert drawn(empty).min() == 255
 
 

@@ -11,8 +11,7 @@ import trimesh
 import sq_perception as sq
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
-from sq_perception.simulation.sample import sample
-from sq_perception.simulation.scenes import thesis_bodies
+from sq_perception.simulation.scenes import sample, thesis_bodies
 
 BODY = sq.Superquadric(
     np.array([0.05, 0.03, 0.08]), np.array([0.3, 0.7]), np.array([0.1, -0.2, 0.5]), np.array([0.3, -0.2, 0.5, 0.8])

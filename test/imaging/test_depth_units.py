@@ -5,8 +5,7 @@ import pytest
 from table_scenes import Table, noisy
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.depth_units import UnitsError, metres, parse_scale, wrong_unit, z_from_range
-from sq_perception.imaging.ranges import seem_ranges
+from sq_perception.imaging.depth_units import UnitsError, metres, parse_scale, seem_ranges, wrong_unit, z_from_range
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 

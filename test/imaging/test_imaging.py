@@ -14,7 +14,7 @@ from unit_axis import cell_centres, soft_images
 from sq_perception.geometry import Superquadric, rotation
 from sq_perception.imaging import canonical_view, raycast, soft_agreement, soft_render, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation import view_rendering
+from sq_perception.simulation import rendering
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene, thesis_bodies
 
 VGA = Camera(640, 480, 520.0, 530.0, 322.5, 238.0)
@@ -218,7 +218,7 @@ class TestCanonicalView:
 
     def test_direct_rendering_is_the_view_of_the_image(self) -> None:
         bodies = thesis_bodies(20, np.random.default_rng(7))
-        images, canonical = view_rendering.render_views(bodies, levels=np.full(20, 255.0))
+        images, canonical = rendering.render_views(bodies, levels=np.full(20, 255.0))
         for k, body in enumerate(bodies):
             depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(512))
             depth = np.where(np.isfinite(depth), depth, np.nan)
@@ -241,8 +241,8 @@ class TestCanonicalView:
             eye = rotation.to_matrix(view.rotation) @ -view.anchor / view.extent + [0.5, 0.5, canonical_view.NEAREST]
             _, upper = canonical.bounding_box()
             batch = Superquadric.from_flat(canonical.to_flat()[None])
-            near, same = view_rendering.render_views(batch, distance=eye[2:] - upper[2])
-            far, _ = view_rendering.render_views(batch)
+            near, same = rendering.render_views(batch, distance=eye[2:] - upper[2])
+            far, _ = rendering.render_views(batch)
             np.testing.assert_allclose(same[0].to_flat()[:8], canonical.to_flat()[:8], atol=0.05)
             off_near.append(np.abs(view.image - near[0]).mean())
             off_far.append(np.abs(view.image - far[0]).mean())

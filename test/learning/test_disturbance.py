@@ -7,7 +7,7 @@ from sq_perception import Camera, Superquadric
 from sq_perception.imaging import canonical_view, raycast, regions
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.learning.dataset import Disturbance, ViewPool, ViewSource, any_occluder, draw_views, wide_bodies
-from sq_perception.simulation import view_rendering
+from sq_perception.simulation import rendering
 from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene, thesis_bodies
 
 VGA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -27,8 +27,8 @@ class TestOccluder:
         bodies, share = thesis_bodies(60, rng), rng.uniform(0.1, 0.4, 60)
         occluder = any_occluder(share, rng)
         occluder.thickness[:] = np.inf
-        whole, free = view_rendering.render_views(bodies)
-        views, fitted = view_rendering.render_views(bodies, occluder=occluder)
+        whole, free = rendering.render_views(bodies)
+        views, fitted = rendering.render_views(bodies, occluder=occluder)
         side = free.size[:, 0] / fitted.size[:, 0]
         area = (views > 0).sum(axis=(1, 2)) * side**2 / (whole > 0).sum(axis=(1, 2))
         assert np.abs(area - (1 - share)).max() < 0.06
@@ -52,14 +52,14 @@ class TestOccluder:
     def test_without_one_nothing_changes(self) -> None:
         bodies = thesis_bodies(8, np.random.default_rng(4))
         nothing = any_occluder(np.zeros(8), np.random.default_rng(5))
-        plain, plain_bodies = view_rendering.render_views(bodies)
-        views, same = view_rendering.render_views(bodies, occluder=nothing, miss=np.zeros((8, 4)))
+        plain, plain_bodies = rendering.render_views(bodies)
+        views, same = rendering.render_views(bodies, occluder=nothing, miss=np.zeros((8, 4)))
         np.testing.assert_array_equal(views, plain)
         np.testing.assert_array_equal(same.to_flat(), plain_bodies.to_flat())
 
     def test_whole_body_cannot_be_hidden(self) -> None:
         with pytest.raises(ValueError, match="below 1"):
-            view_rendering.render_views(
+            rendering.render_views(
                 thesis_bodies(1, np.random.default_rng(0)), occluder=any_occluder(np.ones(1), np.random.default_rng(0))
             )
 
@@ -138,7 +138,7 @@ class TestWear:
 
 def test_a_pool_pairs_views_with_their_bodies() -> None:
     images, bodies = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32).batch(16)
-    again, _ = view_rendering.render_views(bodies, 32)
+    again, _ = rendering.render_views(bodies, 32)
     assert np.abs(again - images).mean() < 0.01
 
 

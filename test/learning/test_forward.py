@@ -19,7 +19,7 @@ from sq_perception.learning.forward import CompactMasks, CompactRegressor, Compa
 from sq_perception.learning.inference import predict_in_positions
 from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig
 from sq_perception.learning.networks import MaskNetwork, Regressor, ThingNetwork
-from sq_perception.simulation import view_rendering
+from sq_perception.simulation import rendering
 
 FORMS = [
     RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32),
@@ -174,7 +174,7 @@ def test_moved_images_are_images_of_the_moved_bodies() -> None:
     images, bodies = draw_views(48, rng)
     turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
     shown, moved = inference.move_images(images, turns, mirror), inference.move_bodies(bodies, turns, mirror)
-    again, _ = view_rendering.render_views(moved)
+    again, _ = rendering.render_views(moved)
     assert ((again > 0) != (shown > 0)).mean() < 0.001
     assert np.abs(again - shown)[(again > 0) & (shown > 0)].mean() < 0.004
 

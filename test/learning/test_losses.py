@@ -14,8 +14,8 @@ from sq_perception.imaging import soft_render
 from sq_perception.learning import losses
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 from sq_perception.learning.losses import Objective
+from sq_perception.simulation.rendering import render_views
 from sq_perception.simulation.scenes import thesis_bodies
-from sq_perception.simulation.view_rendering import render_views
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 DOUBLE = torch.float64

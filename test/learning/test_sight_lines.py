@@ -7,8 +7,8 @@ from unit_axis import cell_centres
 
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import soft_render, unit_cube
+from sq_perception.simulation.rendering import render_views
 from sq_perception.simulation.scenes import thesis_bodies
-from sq_perception.simulation.view_rendering import render_views
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 SPHERE = Superquadric.from_flat(torch.tensor([[0.3, 0.3, 0.3, 1, 1, 0.5, 0.5, 0.5, *IDENTITY]], dtype=torch.float64))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from python_process import run_python
 
-from sq_perception.simulation.sample import THINGS
+from sq_perception.simulation.scenes import THINGS
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 CARTON = sorted(1e3 * edge for edge in THINGS["carton"][0])
