@@ -41,31 +41,17 @@ from sq_perception.imaging.raycast import heights
 
 _STEEPEST = 6.0
 """Largest slope, 80 degrees; steeper pixels count as this, as they determine little of the depth."""
-BAND_PIXELS, _BAND_SHARE = 4, 0.03
+BAND_PIXELS = 4
 """Least width, pixels, of the band around the mask whose every pixel counts, as that much of a mask's edge may be
-missing; and its width as a share of the mask's extent."""
-_WIDER = 0.5
-"""Margins of the crop around the mask, both sides together, as a share of the mask's extent."""
-_HOLE = 5
-"""Width, pixels, up to which holes and notches of the mask are closed: the outline of a convex body has none."""
-_JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
-"""Pixel widths and noise levels whose sum a depth step between neighbours exceeds where a surface ends."""
-_FOOT_PIXELS = 3
-"""Width, pixels, of the part of an object's foot that is no higher than its support."""
+missing."""
 _BEHIND_SHARE = 0.02
 """Share of a mask's pixels joined to the object by way of its support alone, from which on the mask is too large: by
 one pixel around an object of 150.  One in twenty right masks of benchmarks/household_things has as much, from its
 sensor's edges, which changes no mean; with 0.05, clean boxes in masks one pixel too large lost 3 % IoU."""
 _COARSE = 3
 """Spacing, pixels in each direction, of free pixels far from the mask."""
-_FREE_MARGIN = 3.0
-"""Standard deviations in front of the measured depth at which free space ends."""
-_POINTS = 2000
-"""Measured points of an object: enough for its moments, boxes and quantiles to settle."""
 OUTLIER_SHARE = 0.01
 """Share of the points left out at either end of a direction: readings of something else that got into the mask."""
-_SAMPLES = 5000
-"""Third differences that are taken, about: their median is then known to 1.5 %."""
 _FEWEST = 8
 """Fewest differences for an estimate: with fewer, one edge within the mask is the median."""
 
@@ -85,18 +71,9 @@ class DepthNoise(NamedTuple):
 class Crop:
     """An object and its surroundings in an image, as far as they do not depend on how far the object strays.
 
-    Attributes
-    ----------
-    depth, mask : (h, w)
-        NaN where nothing was measured; the caller's mask.  ``camera`` belongs to both.
-    band : int
-        Width, in pixels, of the band around the mask whose every pixel counts.
-    noise : DepthNoise
-        The depth noise.
-    distance : float
-        Mean depth of the object, metres.
-    footprint : float
-        Width of a pixel at that distance, metres.
+    ``depth`` (h, w) is NaN where nothing was measured; ``mask`` is the caller's, ``camera`` belongs to both.  Every
+    pixel counts in a ``band`` of so many pixels around the mask.  ``distance`` is the mean depth of the object,
+    ``footprint`` the width of a pixel there, metres.
     """
 
     depth: np.ndarray
@@ -112,8 +89,8 @@ class Crop:
         """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
         x, y, width, height = regions.box(np.ascontiguousarray(mask))
         extent = max(width, height)
-        band = max(BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
-        margin = max(band, math.ceil(_WIDER * extent / 2))
+        band = max(BAND_PIXELS, math.ceil(0.03 * extent))
+        margin = max(band, math.ceil(extent / 4))
         top, left = max(y - margin, 0), max(x - margin, 0)
         bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)
         crop = np.ascontiguousarray(depth[top:bottom, left:right], dtype=np.float32)
@@ -132,8 +109,9 @@ class Crop:
     def observe(self, model_error: float, nan_is_empty: bool | None, plane: np.ndarray | None = None) -> Observation:
         """The crop, its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``plane`` as in the options."""
         sigma = math.hypot(self.noise.sigma, model_error)
-        inside = self._coherent(_JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma, plane)
-        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
+        inside = self._coherent(10 * self.footprint + 6 * sigma, plane)
+        # Holes and notches of five pixels are closed: the outline of a convex body has none.
+        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
         near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
         if nan_is_empty is None:
@@ -143,7 +121,7 @@ class Crop:
             nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < 0.1
         lost = regions.convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
-        shown = draw(pixels, areas, _POINTS, 0.5)
+        shown = draw(pixels, areas, 2000, 0.5)
         v, u = np.divmod(shown, self.camera.width)
         return Observation(
             **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, areas=areas, free=free, free_pixels=free_pixels,
@@ -164,7 +142,8 @@ class Crop:
         if not low.any() or 2 * np.count_nonzero(low) > np.count_nonzero(self.mask):
             return inside
         above = coherent(self.depth, self.mask & ~low, jump)
-        with_foot = depth_steps.grow(above.astype(np.int32), low, self.depth, _FOOT_PIXELS, depth_steps.STEP) > 0
+        # Three pixels of an object's foot are no higher than its support.
+        with_foot = depth_steps.grow(above.astype(np.int32), low, self.depth, 3, depth_steps.STEP) > 0
         is_too_large = np.count_nonzero(with_foot) < (1 - _BEHIND_SHARE) * np.count_nonzero(inside)
         return above if is_too_large else inside
 
@@ -173,21 +152,10 @@ class Crop:
 class Observation(Crop):
     """A crop whose pixels are sorted; the mask is that of the object, with its small holes closed.
 
-    Attributes
-    ----------
-    pixels : (n,)
-        All pixels of the object, as indices into the crop in row-major order.
-    areas : (n,)
-        Weights of these pixels for drawing.
-    free : (m,)
-        The pixels beside the object that may constrain it, likewise.
-    free_pixels : int
-        Number of pixels that these stand for.
-    model_error : float
-        How far the object may stray from a superquadric, metres; joins the noise in squares.
-    points : (k, 3)
-        Some 2000 measured points of the object in the optical frame, evenly over its surface; each coordinate a
-        contiguous column, which is reduced several times as fast.
+    ``pixels`` (n,) are those of the object, as indices into the crop in row-major order, ``areas`` (n,) their weights
+    for drawing; ``free`` (m,) those beside it that may constrain it and stand for ``free_pixels``.  The object may
+    stray from a superquadric by ``model_error``, which joins the noise in squares.  ``points`` (k, 3): some 2000
+    measured ones, evenly over the surface; each coordinate a contiguous column, which is reduced several times as fast.
     """
 
     pixels: np.ndarray
@@ -227,8 +195,8 @@ class Observation(Crop):
         return self.free_rays_of(pixels)
 
     def free_rays_of(self, pixels: np.ndarray) -> np.ndarray:
-        """The rays through some of the free pixels."""
-        return self._through(pixels, _FREE_MARGIN)
+        """The rays through some of the free pixels; their space ends three standard deviations before the reading."""
+        return self._through(pixels, 3.0)
 
     def ring(self, radius: float) -> np.ndarray:
         """The free pixels at distance ``radius`` from the mask, to half a pixel: at 1, those that touch it."""
@@ -336,7 +304,8 @@ def estimate_noise(depth: np.ndarray, inside: np.ndarray, least: float) -> Depth
 @kernel
 def _noise(depth: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
     """The standard deviation by third differences, and the quantum of the first ones; 0 for what is not known."""
-    third, first = _differences(depth, inside, max(1, int(2 * np.count_nonzero(inside) / _SAMPLES)))
+    # The median of 5000 third differences is known to 1.5 %.
+    third, first = _differences(depth, inside, max(1, np.count_nonzero(inside) // 2500))
     if third.size < _FEWEST:
         return 0.0, 0.0
     median = np.partition(third, third.size // 2)[third.size // 2]

@@ -45,8 +45,6 @@ START_EXPONENT = 0.5
 """Moment over squared half size, and exponents, of a start: between ellipsoid (0.2, 1) and box (1/3, 0)."""
 EIGHTH_TURNS = quaternions.to_matrix(quaternions.from_rotation_vector(np.eye(3) * math.pi / 4))
 """Rotations (3, 3, 3) by 45 degrees about each axis."""
-_EXPONENTS = (0.3, 0.8)
-"""Exponents of the last group: between box and ellipsoid, nearer to either."""
 ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 """Which of three right-handed axes are x, y and z, so that each is z once."""
 
@@ -125,17 +123,12 @@ def boxes(low: np.ndarray, high: np.ndarray, axes: np.ndarray, exponent: float =
 
 
 def groups(observation: Observation) -> Iterator[list[State]]:
-    """Groups of starts in the order in which to try them, the last one of everything at once, boxes too; boxes of the
-    points alone where nothing shows the symmetry."""
-    completed = completed_moments(observation)
-    if completed is None:
-        yield principal(observation.points)
-        return
-    axes = principal_axes(completed[1])
-    turned = [axes, *eighth_turns(axes)]
-    yield from (states(*completed, each) for each in turned)
-    boxes = principal(observation.points)
-    yield boxes + [state for e in _EXPONENTS for each in turned for state in states(*completed, each, e)]
+    """Groups of starts in the order in which to try them: bodies completed by symmetry, if anything shows it, and boxes
+    of the points."""
+    if (completed := completed_moments(observation)) is not None:
+        axes = principal_axes(completed[1])
+        yield from (states(*completed, each) for each in (axes, *eighth_turns(axes)))
+    yield principal(observation.points)
 
 
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
@@ -215,13 +208,14 @@ def eighth_turns(axes: np.ndarray) -> np.ndarray:
     return np.asarray(axes @ EIGHTH_TURNS)
 
 
-def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = START_EXPONENT) -> list[State]:
+def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> list[State]:
     """The three bodies with these axes and moments, one for each choice of z."""
     found = []
     for rotation in three_orders(axes):
         spread = np.einsum("ji,jk,ki->i", rotation, moments, rotation)
         size = np.sqrt(np.maximum(spread, 1e-12) / MOMENT_SHARE)
-        found.append(State(np.concatenate([size, [exponent, exponent], centre, [0.0, 0.0]]), rotation, math.inf, 0))
+        parameters = np.concatenate([size, [START_EXPONENT] * 2, centre, [0.0, 0.0]])
+        found.append(State(parameters, rotation, math.inf, 0))
     return found
 
 

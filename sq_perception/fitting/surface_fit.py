@@ -151,8 +151,8 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """An object to fit: the image near it, and whether it is all that was measured, as the unit cube's bodies and walls
-    before a camera are; the caller's starts, ``later`` those that cost time; when the fit began."""
+    """An object to fit: the image near it, and whether it fills that, as the unit cube's bodies and walls before a
+    camera do; the caller's starts, ``later`` those that cost time; when the fit began."""
 
     crop: Crop
     fills_image: bool
@@ -309,9 +309,9 @@ def _finish(problem: Problem, finalists: Sequence[State]) -> Solution:
     return Solution(problem, refined[0], rays)
 
 
-def _is_explained(solution: Solution, noise: float) -> bool:
-    """Return whether a thing's body leaves less than the noise, so that a superquadric may explain the image."""
-    return deviation(np.abs(solution.distances)) < noise
+def _is_explained(thing: Solution, noise: float) -> bool:
+    """Whether a thing's body leaves less than the noise, so that a superquadric may explain the image."""
+    return deviation(np.abs(thing.distances)) < noise
 
 
 def warm_up() -> None:
