@@ -30,7 +30,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sq_perception.fitting.cost import SAMPLE, draw, rays_through
+from sq_perception.fitting.cost import SAMPLE, rays_through
 from sq_perception.fitting.options import ON_SUPPORT
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
@@ -97,9 +97,10 @@ class Crop:
         measured = np.isfinite(crop) & (crop > 0) if camera.is_pinhole else np.isfinite(crop)
         crop = np.where(measured, crop, np.float32(np.nan))
         inside = np.ascontiguousarray(mask[top:bottom, left:right])
-        distance = _mean_depth(crop, inside)
-        if not math.isfinite(distance):
+        readings = crop[inside & np.isfinite(crop)]
+        if not readings.size:
             return None
+        distance = float(readings.mean(dtype=float))
         least = 1e-6 * max(abs(distance), 1e-3)  # what single precision resolves
         known = estimate_noise(crop, inside, least) if noise is None else DepthNoise(noise)
         footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
@@ -121,10 +122,11 @@ class Crop:
             nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < 0.1
         lost = regions.convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
-        shown = draw(pixels, areas, 2000, 0.5)
+        reach = np.cumsum(areas, dtype=float)
+        shown = draw(pixels, reach, 2000, 0.5)
         v, u = np.divmod(shown, self.camera.width)
         return Observation(
-            **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, areas=areas, free=free, free_pixels=free_pixels,
+            **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, reach=reach, free=free, free_pixels=free_pixels,
             model_error=model_error, points=np.asfortranarray(self.camera.unproject(u, v, self.depth.ravel()[shown])),
         )
 
@@ -152,14 +154,14 @@ class Crop:
 class Observation(Crop):
     """A crop whose pixels are sorted; the mask is that of the object, with its small holes closed.
 
-    ``pixels`` (n,) are those of the object, as indices into the crop in row-major order, ``areas`` (n,) their weights
-    for drawing; ``free`` (m,) those beside it that may constrain it and stand for ``free_pixels``.  The object may
-    stray from a superquadric by ``model_error``, which joins the noise in squares.  ``points`` (k, 3): some 2000
+    ``pixels`` (n,) are those of the object, as indices into the crop in row-major order, ``reach`` (n,) their areas
+    summed up to each; ``free`` (m,) those beside it that may constrain it and stand for ``free_pixels``.  The object
+    may stray from a superquadric by ``model_error``, which joins the noise in squares.  ``points`` (k, 3): some 2000
     measured ones, evenly over the surface; each coordinate a contiguous column, which is reduced several times as fast.
     """
 
     pixels: np.ndarray
-    areas: np.ndarray
+    reach: np.ndarray
     free: np.ndarray
     free_pixels: int
     model_error: float
@@ -185,7 +187,7 @@ class Observation(Crop):
 
         Draws with other offsets (0 to 1) take other pixels.
         """
-        return self._through(draw(self.pixels, self.areas, count, offset), 0.0)
+        return self._through(draw(self.pixels, self.reach, count, offset), 0.0)
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """At most ``count`` rays (k, 9) of free pixels, drawn evenly; z is where free space ends."""
@@ -232,17 +234,12 @@ def span(points: np.ndarray, directions: np.ndarray, outliers: float = OUTLIER_S
     return np.asarray(lower + (upper - lower) * (place - before))
 
 
-@kernel
-def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
-    total, count = 0.0, 0
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if inside[v, u] and np.isfinite(depth[v, u]):
-                total += depth[v, u]
-                count += 1
-    if count == 0:
-        return np.nan
-    return total / count
+def draw(pixels: np.ndarray, reach: np.ndarray, count: int, offset: float) -> np.ndarray:
+    """All of the pixels (n,), or about ``count``, systematically by their areas, summed up to each in ``reach``."""
+    if len(pixels) <= count:
+        return pixels
+    chosen = np.searchsorted(reach, (np.arange(count) + offset) * (reach[-1] / count), side="right")
+    return pixels[np.unique(np.minimum(chosen, len(pixels) - 1))]
 
 
 @kernel
@@ -296,51 +293,28 @@ def _write_areas(depth: np.ndarray, inside: np.ndarray, v: int, footprint: float
 
 def estimate_noise(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
     """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be estimated."""
-    spread, quantum = _noise(depth, inside)
-    is_rounded = spread < 0.5 * quantum
-    return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum if is_rounded else 0.0)
-
-
-@kernel
-def _noise(depth: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
-    """The standard deviation by third differences, and the quantum of the first ones; 0 for what is not known."""
-    # The median of 5000 third differences is known to 1.5 %.
-    third, first = _differences(depth, inside, max(1, np.count_nonzero(inside) // 2500))
+    step = max(1, np.count_nonzero(inside) // 2500)  # the median of 5000 third differences is known to 1.5 %
+    third, first = np.hstack([_differences(depth, inside, step), _differences(depth.T, inside.T, step)])
     if third.size < _FEWEST:
-        return 0.0, 0.0
+        return DepthNoise(least)
     median = np.partition(third, third.size // 2)[third.size // 2]
     moved = first[first > 0]
     if moved.size >= _FEWEST:
         rank = moved.size // 50
-        quantum = np.partition(moved, rank)[rank]
+        quantum = float(np.partition(moved, rank)[rank])
         steps = moved / quantum
-        if np.count_nonzero(np.abs(steps - np.rint(steps)) < 0.02) > 0.8 * moved.size:
+        if np.mean(np.abs(steps - np.rint(steps)) < 0.02) > 0.8:
             # The median of whole steps is a whole step; beyond six of either is an edge.
             near = third[third < 6.0 * max(median, quantum)]
-            return math.sqrt(np.mean(near * near) / 20.0), quantum
-    return MEDIAN_TO_SIGMA * median / math.sqrt(20.0), 0.0
+            spread = math.sqrt(np.mean(near * near) / 20.0)
+            is_rounded = spread < 0.5 * quantum
+            return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum if is_rounded else 0.0)
+    return DepthNoise(max(MEDIAN_TO_SIGMA * float(median) / math.sqrt(20.0), least))
 
 
-@kernel
-def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Absolute third and first differences along rows and columns, every ``step``-th line."""
-    height, width = depth.shape
-    most = ((height - 1) // step + 1) * width + ((width - 1) // step + 1) * height
-    third, first = np.empty(most), np.empty(most)
-    count = 0
-    for down, right in ((0, 1), (1, 0)):
-        for v in range(0, height - 3 * down, 1 if down else step):
-            for u in range(0, width - 3 * right, 1 if right else step):
-                line = True
-                for k in range(4):
-                    line = line and inside[v + k * down, u + k * right]
-                if not line:
-                    continue
-                a, b = depth[v, u], depth[v + down, u + right]
-                c, d = depth[v + 2 * down, u + 2 * right], depth[v + 3 * down, u + 3 * right]
-                value = abs(a - 3.0 * b + 3.0 * c - d)
-                if value >= 0.0:
-                    third[count] = value
-                    first[count] = abs(np.float64(a) - np.float64(b))
-                    count += 1
-    return third[:count], first[:count]
+def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> np.ndarray:
+    """Absolute third and first differences (2, n) along every ``step``-th row."""
+    rows, within = depth[::step].astype(float), inside[::step]
+    third, first = np.abs(np.diff(rows, 3)), np.abs(np.diff(rows))[:, : max(rows.shape[1] - 3, 0)]
+    known = within[:, :-3] & within[:, 1:-2] & within[:, 2:-1] & within[:, 3:] & (third >= 0)
+    return np.stack([third[known], first[known]])

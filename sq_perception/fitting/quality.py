@@ -92,10 +92,6 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     Where an image is some 10^8 times as precise in one direction as the prior is in another, rounding hides the small
     eigenvalues, and an inverse may have variances below 0 or far above the prior's: the eigenvalues are then held.
     """
-    inverse = np.linalg.inv(information)
-    variances = np.diag(inverse)
-    if (variances > 0.0).all() and (variances < 2.0 / least).all():
-        return inverse
     values, axes = np.linalg.eigh(information)
     return (axes / np.maximum(values, least)) @ axes.T
 
