@@ -45,8 +45,7 @@ from common.hull_columns import Columns
 from common.scene_verdict import FEWEST_PIXELS, HALF
 from known_frames import camera_of
 
-from sq_perception.fitting import course as tolerant
-from sq_perception.fitting import surface_fit
+from sq_perception.fitting import multistart, surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
@@ -100,7 +99,7 @@ def _support(hull: HullPrior, seen: Seen) -> np.ndarray:
 
 
 def _rays(count: float) -> AbstractContextManager[Any]:
-    return patch.object(tolerant, "INDEPENDENT", count)
+    return patch.object(multistart, "INDEPENDENT", count)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """What each numeric constant of fitting, segmentation and tracking decides: varied by 30 % to either side, by itself.
 
-    python benchmarks/constants.py [--only fitting.course tracking ...] [--kernels] [--name constants]
+    python benchmarks/constants.py [--only fitting.starts tracking ...] [--kernels] [--name constants]
 
 Constants are the numbers that modules of these rooms name in capitals, and the defaults of their options.  Every one is
 multiplied by 0.7 and by 1.3 (whole numbers change at least by one, of numbers just below 1 what is missing to 1), and

@@ -38,7 +38,7 @@ import single_body
 from common import report
 from common.hull_columns import Columns
 
-from sq_perception.fitting import course, multistart, starts, surface_fit, valleys
+from sq_perception.fitting import multistart, starts, surface_fit, valleys
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.observation import BAND_PIXELS
 from sq_perception.fitting.options import FitOptions
@@ -104,10 +104,10 @@ PARTS: dict[str, Part] = {
     "open ends": _without(valleys, lengthen_open_ends=_same),
     "open sizes": _without(valleys, weigh_open_sizes=_same),
     "oval": _without(valleys, add_oval=_same),
-    "straight where a taper tells little": _without(course, _straighten=_same),
-    "sharper outline": _without(course, sharpen_outline=lambda problem, state, *_: (problem, state)),
-    "lost edge": _without(course, drop_lost_edge=lambda problem, state: (problem, state)),
-    "more rays under noise": _without(course, _MOST_FINAL_RAYS=course.FINAL_RAYS),
+    "straight where a taper tells little": _without(surface_fit, _straighten=_same),
+    "sharper outline": _without(surface_fit, sharpen_outline=lambda problem, state, *_: (problem, state)),
+    "lost edge": _without(surface_fit, drop_lost_edge=lambda problem, state: (problem, state)),
+    "more rays under noise": _without(surface_fit, _MOST_FINAL_RAYS=surface_fit._FINAL_RAYS),
     "starts turned by 45 degrees": _without(starts, eighth_turns=lambda _: np.empty((0, 3, 3))),
     "other exponents of starts": _without(starts, _EXPONENTS=()),
     "a superquadric of a thing": _without(surface_fit, _is_explained=lambda *_: False, _FINE_NOISE=0.0),

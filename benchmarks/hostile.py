@@ -21,9 +21,10 @@ from common import (
     own_domain,  # noqa: F401
     report,
 )
+from common.process_usage import usage
 from hostile_messages import HostileFrame, Siege, Verdict, difference, frames
 from hypothesis import HealthCheck, Phase, given, seed, settings
-from running_nodes import Peer, arguments, environment, until, usage
+from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import Image
 from started_nodes import Children
 

@@ -25,7 +25,8 @@ from common import (
     own_domain,  # noqa: F401
     report,
 )
-from running_nodes import Peer, arguments, environment, until, usage
+from common.process_usage import usage
+from running_nodes import Peer, arguments, environment, until
 from started_nodes import Children
 
 from sq_perception.nodes import synthetic_depth_node as frame_source

@@ -24,17 +24,9 @@ from common import (
     own_domain,  # noqa: F401
     report,
 )
+from common.process_usage import Usage, usage
 from rcl_interfaces.srv import GetParameters
-from running_nodes import (
-    Answer,
-    Diagnosis,
-    Peer,
-    Usage,
-    arguments,
-    environment,
-    until,
-    usage,
-)
+from running_nodes import Answer, Diagnosis, Peer, arguments, environment, until
 from started_nodes import Children
 from std_srvs.srv import SetBool
 

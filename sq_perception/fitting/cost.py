@@ -136,14 +136,6 @@ def add_block(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
 
 
 @kernel
-def add_row(row: np.ndarray, sums: np.ndarray) -> None:
-    """Add the outer product of a single residual's row (14,)."""
-    for k in range(STEP_LENGTH + 1):
-        for j in range(k + 1):
-            sums[k, j] += row[k] * row[j]
-
-
-@kernel
 def rays_of(points: np.ndarray) -> np.ndarray:
     """Rays (n, 9) of points (n, 3) without a camera, each of weight 1."""
     rays = np.zeros((points.shape[0], RAY_COLUMNS))

@@ -28,9 +28,12 @@ import numpy as np
 from sq_perception.fitting import point_cost, points
 from sq_perception.fitting.cost import STEP_LENGTH
 from sq_perception.fitting.fit import Parts
-from sq_perception.fitting.point_cloud import UnitCloud
-from sq_perception.fitting.point_cost import Cloud, Course, Mixture
-from sq_perception.fitting.starts import principal_axes
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.observation import span
+from sq_perception.fitting.options import MIN_PIXELS
+from sq_perception.fitting.point_cost import Cloud, Course, Mixture, UnitCloud
+from sq_perception.fitting.quality import fail
+from sq_perception.fitting.starts import START_EXPONENT, boxes, principal_axes
 
 MOST_PARTS = 6
 _POINTS, _PROBES = 800, 800
@@ -72,9 +75,8 @@ def decompose(
         raise ValueError(f"most: expected 1 or more parts, got {most}")
     given, normals = points.surface_of(thing, normals)
     cloud = UnitCloud.of(given, normals, points.MOST_POINTS)
-    reason = points.reason_to_fail(cloud)
-    if reason:
-        alone = points.fail(cloud, reason, began)
+    if reason := points.reason_to_fail(cloud):
+        alone = fail(given, 0.01 * cloud.scale, math.nan, reason, began)
         return Parts((alone,), np.zeros(1), alone.status, reason, math.nan, alone.milliseconds)
     search = _Search(cloud, _with_probes(cloud, given), sigma)
     mixture = search.prune(search.grow(most))
@@ -156,7 +158,7 @@ class _Search:
         for some in (unexplained, unfilled):
             if (box := _box_of_group(some)) is not None:
                 yield wide._replace(
-                    bodies=np.concatenate([bodies, box[0][None]]), turns=np.concatenate([turns, box[1][None]])
+                    bodies=np.append(bodies, [box.parameters], 0), turns=np.append(turns, [box.rotation], 0)
                 )
 
     @staticmethod
@@ -167,20 +169,18 @@ class _Search:
         )
 
 
-def _box_of_group(some: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """A box (10,) around the largest group of the points, and its rotation; None where there are too few."""
+def _box_of_group(some: np.ndarray) -> State | None:
+    """A box around the largest group of the points; None where there are too few."""
     from scipy.spatial import cKDTree  # here: a node that recovers does without
 
-    if len(some) < 2 * points.MIN_PIXELS:
+    if len(some) < 2 * MIN_PIXELS:
         return None
     near = cKDTree(some).query_ball_point(some, 0.5)
     group = some[near[int(np.argmax([len(each) for each in near]))]]
-    if len(group) < points.MIN_PIXELS:
+    if len(group) < MIN_PIXELS:
         return None
-    turn = principal_axes(np.cov(group.T))
-    low, high = (group @ turn).min(axis=0), (group @ turn).max(axis=0)
-    half = np.maximum((high - low) / 2, 0.05)
-    return np.array([*half, 0.5, 0.5, *(turn @ (low + high) / 2), 0.0, 0.0]), np.ascontiguousarray(turn)
+    axes = principal_axes(np.cov(group.T))
+    return boxes(*span(group, axes.T, 0.0).T, axes, START_EXPONENT)[-1]
 
 
 def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:

@@ -6,7 +6,8 @@ The cost of a body is minus twice the logarithm of its posterior, docs/surface_f
 
 over the object's rays and those of free space (:mod:`sq_perception.fitting.residuals`), with the noise s, the model
 error m, and the priors of :mod:`sq_perception.fitting.priors`.  A body that leaves nothing but noise costs about the
-total weight of the object's rays.
+total weight of the object's rays.  A superquadric (m = 0) and a thing that strays from one (m > 0) are one cost with
+other terms.
 
 A search goes through stages (:class:`Stage`): from each body at hand so many steps with a residual on so many rays;
 the best ones that the noise does not tell apart go on.
@@ -27,7 +28,7 @@ import numpy as np
 from sq_perception.fitting.cost import Ray, Rays, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.options import FitOptions
+from sq_perception.fitting.options import MODEL_ERROR, TAPER, FitOptions, limits
 from sq_perception.fitting.quality import UNTAPERED, Alternative, covariance_at
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 
@@ -44,23 +45,23 @@ class Stage(NamedTuple):
 
 
 # Chosen on benchmarks/single_body and benchmarks/household_things.
-COARSE = Stage(SAMPSON, 150, 8, 3, 0.5)
-BASIN = (Stage(SAMPSON, 300, 15, 3, 0.7), Stage(RENDERED, 300, 15, 3, 0.7))
+SUPERQUADRIC = (
+    Stage(SAMPSON, 150, 8, 3, 0.5), Stage(SAMPSON, 300, 15, 3, 0.7), Stage(RENDERED, 300, 15, 3, 0.7)
+)  # fmt: skip
 THING = (Stage(RENDERED, 150, 8, 4, 0.7), Stage(RENDERED, 150, 15, 3, 0.7))
-SETTLE = Stage(RENDERED, 300, 15, 3, 0.2)
 
-FREE_SHARE = 0.25
-"""Free rays per object ray: an outline has fewer pixels than an area."""
-TOLERANCE, FINAL_TOLERANCE = 1e-3, 3e-5
-"""Gain, as a share of the cost, that a step must promise: a stage ends before one that promises less."""
-DOUBT = 0.3
-"""Excess of a cost over the best, as a share of it, up to which bodies go on together: few steps have not converged."""
+INDEPENDENT = 100.0
+"""Most rays that a thing counts as.  Chosen on benchmarks/household_things: 200 gain on boxes what bottles lose, 50 the
+other way."""
+HUBER = 1.0
+"""Noise levels up to which Huber's loss of a thing's rays is quadratic, and scale of Cauchy's loss behind its surface:
+what strays farther is another part of the thing, a neck or a handle."""
+FINAL_TOLERANCE = 3e-5
+"""Gain, as a share of the cost, that a step of the last stage must promise: it ends before one that promises less."""
 SLACK = 1.0
 """Difference of costs that few rays may hide: noise gives one of D a standard deviation of 2 sqrt(D)."""
 SIGNIFICANT = 0.5
 """A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
-_ALIKE, _ALONG = 0.01, 0.95
-"""Half sizes that differ by less than this share are the same, and axes with a cosine above this one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +92,47 @@ class Problem:
     deadline: float
     independent: float | None = None
 
+    @classmethod
+    def of(cls, observation: Observation, options: FitOptions, deadline: float) -> Problem:
+        """The problem of an object as a superquadric, or as a thing where its observation knows a model error.
+
+        A thing is fitted as its convex hull, which encloses lids below a rim, necks and handles: points behind the
+        surface count by Cauchy's loss, and space within the outline's convex hull may be empty.
+        """
+        model_error = observation.model_error
+        hull = options.predicted_hull() if model_error else None
+        terms = Terms(
+            hit_tolerance=3e-3,  # a search remembers where rays met the body, so that the error vanishes in the end
+            pinhole=float(observation.camera.is_pinhole), outline_stiffness=1 / observation.outline,
+            proportion_stiffness=1.0,  # a factor e about the mean of the three: a wide prior
+        )
+        if options.plane is not None:
+            # Lengths shrink with the model error of small things: without, household things 0.4 times as large lost
+            # 0.7 +- 0.3 % of IoU.
+            scale = min((model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
+            terms = terms._replace(
+                plane=options.plane,
+                plane_stiffness=1 / (0.001 * scale),  # how well a plane fitted to a depth image is known
+                gap_stiffness=1 / (0.005 * scale), rest_stiffness=1 / 0.05,  # wide priors with long tails
+            )
+        if model_error:
+            observation = observation.of_hull()
+            terms = terms._replace(huber=HUBER, inner_cauchy=HUBER)
+        if hull is not None:
+            terms = terms._replace(
+                proportion_stiffness=0.0,
+                taper_stiffness=1 / 0.3,  # of household things bottles have the largest ones, up to 0.6
+                # Writable and of double precision: kernels would be compiled again for other arrays.
+                hull_directions=np.array(hull.directions, float, order="C"),
+                hull_support=np.array(hull.support, float, order="C"),
+                hull_root=hull.root, hull_freedom=float(hull.freedom),
+            )
+        elif model_error or options.plane is not None:
+            # What the image does not determine is not to grow.  Chosen on scanned objects.
+            terms = terms._replace(volume_price=0.5, roundness_stiffness=1 / 0.06 if model_error else 0.0)
+        bounds = limits(observation.points, 0.0 if hull is None else TAPER)
+        return cls(observation, options, terms, bounds, deadline, INDEPENDENT if model_error else None)
+
     @property
     def late(self) -> bool:
         """Whether the time is up."""
@@ -117,7 +159,8 @@ class Problem:
     def draw(self, count: int, offset: float) -> Rays:
         """About ``count`` object rays, and the free rays that come with them."""
         seen = self.observation
-        hits, free = seen.object_rays(count, offset), seen.free_rays(int(FREE_SHARE * count), offset)
+        # An outline has fewer pixels than an area.
+        hits, free = seen.object_rays(count, offset), seen.free_rays(count // 4, offset)
         if self.independent is not None:
             hits[:, Ray.WEIGHT] = self.independent / len(hits)
             if len(free):
@@ -128,23 +171,17 @@ class Problem:
         """The bodies, best first, that go on from the last of some stages; from the first start at least."""
         states = list(starts)
         for stage in stages:
-            found = self.advance(states, stage)
+            rays, found = self.draw(stage.rays, stage.offset), list[State]()
+            for state in states:
+                found.append(self.descend(state, rays, stage.steps, residual=stage.residual))
+                if self.late:
+                    break
             states = (within_doubt(found) if self.independent is None else distinct(by_cost(found)))[: stage.kept]
         return states
 
-    def advance(self, states: Iterable[State], stage: Stage) -> list[State]:
-        """Where a stage leads from each body, in their order, while there is time; from the first one at least."""
-        rays = self.draw(stage.rays, stage.offset)
-        found: list[State] = []
-        for state in states:
-            found.append(self.descend(state, rays, stage.steps, residual=stage.residual))
-            if self.late:
-                break
-        return found
-
     def descend(
-        self, state: State, rays: Rays, steps: int = SETTLE.steps, tolerance: float = TOLERANCE,
-        residual: int = RENDERED, held: int | None = None,
+        self, state: State, rays: Rays, steps: int = 15, tolerance: float = 1e-3, residual: int = RENDERED,
+        held: int | None = None,
     ) -> State:
         """A body after at most so many steps on rays at hand; its half size along an axis may be held."""
         limits = self.limits
@@ -235,7 +272,7 @@ def within_doubt(candidates: Iterable[State]) -> list[State]:
     """Candidates, best first, without those that are worse than the best by more than noise can make them."""
     ranked = distinct(by_cost(candidates))
     least = ranked[0].cost
-    return [state for state in ranked if state.cost <= least + DOUBT * abs(least)]
+    return [state for state in ranked if state.cost <= least + 0.3 * abs(least)]  # few steps have not converged
 
 
 def distinct(states: Iterable[State]) -> list[State]:
@@ -243,7 +280,7 @@ def distinct(states: Iterable[State]) -> list[State]:
     found: list[State] = []
     for state in states:
         z = state.rotation[:, 2]
-        if not any(alike(state, other) and abs(z @ other.rotation[:, 2]) > _ALONG for other in found):
+        if not any(alike(state, other) and abs(z @ other.rotation[:, 2]) > 0.95 for other in found):
             found.append(state)
     return found
 
@@ -253,7 +290,7 @@ def alike(state: State, other: State) -> bool:
     if abs(state.cost - other.cost) > SIGNIFICANT:
         return False
     pairs = zip(sorted(state.parameters[:3].tolist()), sorted(other.parameters[:3].tolist()), strict=True)
-    return all(abs(one - another) < _ALIKE * one for one, another in pairs)
+    return all(abs(one - another) < 0.01 * one for one, another in pairs)
 
 
 def by_cost(states: Iterable[State]) -> list[State]:

@@ -254,9 +254,9 @@ class Observation(Crop):
         return rays_through(pixels, self.depth, self.camera.lens, self.noise.sigma, self.model_error, margin)
 
 
-def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+def span(points: np.ndarray, directions: np.ndarray, outliers: float = OUTLIER_SHARE) -> np.ndarray:
     """Least and largest coordinates (k, 2) of points (n, 3) along directions (k, 3), but for outliers at either end."""
-    place = (len(points) - 1) * np.array([OUTLIER_SHARE, 1 - OUTLIER_SHARE])
+    place = (len(points) - 1) * np.array([outliers, 1 - outliers])
     before = place.astype(int)
     after = np.minimum(before + 1, len(points) - 1)
     along = np.partition(directions @ points.T, (*before, *after), axis=1)

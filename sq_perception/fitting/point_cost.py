@@ -13,12 +13,15 @@ to it, softly.
 
 A probe is a point known to lie outside, or inside, of the object: d is then held at 0 or above, or at 0 or below.
 
-Lengths are in units of the cloud, about 1.
+A cloud is made ready so that its frame, its scale, its order and its density do not matter: coordinates are along its
+principal axes, about its median, in units of its radius (root mean square), and of neighbours in space every so manieth
+stays.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +30,13 @@ from sq_perception.fitting.cost import LANES, RAY_COLUMNS, STEP_LENGTH, Ray, Ter
 from sq_perception.fitting.intersection import ROWS, Lane, gauge_along, padded, place
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.residuals import FOOT, sampson, surface_distance, to_foot
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.superquadric import Superquadric
+
+_PROBE_STEP, _PROBE_WEIGHT = 0.05, 100.0
+"""How far along the normals probes lie, in radii of the cloud, and the weight of their squared distance: a quarter of
+what a point weighs whose noise is as large."""
 
 
 @kernel
@@ -61,6 +70,80 @@ class Cloud(NamedTuple):
     owners: np.ndarray
     background: float
     probe_weight: float
+
+
+@dataclass(frozen=True, eq=False)
+class UnitCloud:
+    """A cloud in its own frame: p = centre + scale axes q.
+
+    Attributes
+    ----------
+    points : (n, 3)
+        q, neighbours one after the other.
+    normals : (n, 3) or None
+        Outward, in the same frame.
+    centre, axes, scale
+        The cloud's frame: (3,) metres, a rotation (3, 3), metres.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None
+    centre: np.ndarray
+    axes: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, points: np.ndarray, normals: np.ndarray | None, most: int) -> UnitCloud:
+        """The cloud of finite points (n, 3), at most so many of them."""
+        from scipy.spatial import cKDTree  # here: a node that recovers does without
+
+        centre = np.median(points, axis=0)
+        centred = points - centre
+        scale = float(np.sqrt(np.mean(np.einsum("ij,ij->i", centred, centred)))) or 1.0
+        centred /= scale
+        _, axes = np.linalg.eigh(centred.T @ centred)
+        axes *= np.where(np.sum((centred @ axes) ** 3, axis=0) < 0, -1.0, 1.0)
+        axes[:, 0] *= np.sign(np.linalg.det(axes))
+        centred = centred @ axes
+        # A tree's leaves are neighbours one after the other.
+        order = cKDTree(centred, leafsize=1, balanced_tree=False, compact_nodes=False).indices
+        if len(order) > most:
+            order = order[np.linspace(0, len(order) - 1, most).astype(int)]
+        turned = None
+        if normals is not None:
+            length = np.linalg.norm(normals[order], axis=1, keepdims=True)
+            turned = normals[order] @ axes / np.where(length > 0, length, 1.0)
+        return cls(np.ascontiguousarray(centred[order]), turned, centre, axes, scale)
+
+    @property
+    def extent(self) -> float:
+        """Half of the diagonal of the box, in units of the cloud."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0))) / 2
+
+    @property
+    def background(self) -> float:
+        """Density of outliers, which may be anywhere in the box."""
+        sides = np.ptp(self.points, axis=0)
+        return 1 / float(np.prod(np.maximum(sides, 0.01 * max(float(sides.max()), 1e-9))))
+
+    def surface(self, count: int | None = None) -> Cloud:
+        """About ``count`` points, or all of them; normals give each a probe on either side."""
+        step = 1 if count is None else max(1, round(len(self.points) / count))
+        points = np.ascontiguousarray(self.points[::step])
+        if self.normals is None:
+            return Cloud(points, np.empty((0, 3)), np.empty(0), np.empty(0, np.int64), self.background, 0.0)
+        step_out = _PROBE_STEP * self.normals[::step]
+        owners = np.tile(np.arange(len(points)), 2)
+        sides = np.repeat([1.0, -1.0], len(points))
+        probes = np.concatenate([points + step_out, points - step_out])
+        return Cloud(points, probes, sides, owners, self.background, _PROBE_WEIGHT)
+
+    def body(self, numbers: np.ndarray, turn: np.ndarray) -> Superquadric:
+        """A body (10,) with its rotation (3, 3) in the frame of the user."""
+        return Superquadric(
+            numbers[0:3] * self.scale, numbers[3:5], self.centre + self.scale * (self.axes @ numbers[5:8]),
+            quaternions.from_matrix(self.axes @ turn), numbers[8:10],
+        )
 
 
 class Mixture(NamedTuple):

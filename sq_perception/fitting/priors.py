@@ -12,8 +12,8 @@ hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions a
 taper       k_x and k_y over their standard deviation: most things do not taper.
 volume      a linear price on log(a1 a2 a3), which prefers the smaller of two bodies that explain the image alike.
 
-Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
-those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms in :class:`~sq_perception.fitting.cost.Terms`.
+Derivatives are added to the normal equations ``sums``; the unknowns are those of
+:mod:`sq_perception.fitting.residuals`, the sizes of the terms in :class:`~sq_perception.fitting.cost.Terms`.
 
 What is known of a thing's convex hull before its pixels are looked at is its support function and its uncertainty:
 
@@ -36,7 +36,7 @@ from functools import cached_property
 
 import numpy as np
 
-from sq_perception.fitting.cost import STEP_LENGTH, Terms, add_block, add_row
+from sq_perception.fitting.cost import STEP_LENGTH, Terms, add_block
 from sq_perception.fitting.intersection import form_of
 from sq_perception.geometry.kernels import kernel, profile_sines, support_at
 
@@ -79,73 +79,64 @@ class HullPrior:
 @kernel
 def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """Cost of all terms together."""
-    cost = 0.0
+    logs = np.log(parameters[:3])
+    cost = terms.volume_price * logs.sum()
+    sums[STEP_LENGTH, :3] += 0.5 * terms.volume_price
     if terms.plane_stiffness > 0.0:
-        cost += _plane_cost(terms, parameters, rotation, sums)
+        down = np.empty((1, 3))
+        down[0] = -terms.plane[:3]
+        rows = _support_rows(down, terms.plane[3:], parameters, rotation)
+        is_below = rows[STEP_LENGTH, 0] > 0.0
+        cost += _add(rows * (terms.plane_stiffness if is_below else terms.gap_stiffness), not is_below, sums)
     if terms.rest_stiffness > 0.0:
-        cost += _rest_cost(terms, rotation, sums)
+        rows, n = np.zeros((STEP_LENGTH + 1, 2)), terms.plane[:3] @ rotation
+        for j in range(2):
+            k = (np.argmax(np.abs(n)) + 1 + j) % 3
+            after, before = (k + 1) % 3, (k + 2) % 3
+            rows[8 + before, j], rows[8 + after, j], rows[STEP_LENGTH, j] = n[after], -n[before], n[k]
+        cost += _add(rows * terms.rest_stiffness, True, sums)
     if terms.proportion_stiffness > 0.0:
-        cost += _proportion_cost(terms, parameters, sums)
+        rows = np.zeros((STEP_LENGTH + 1, 3))
+        rows[:3], rows[STEP_LENGTH] = np.eye(3) - 1.0 / 3.0, logs - logs.mean()
+        cost += _add(rows * terms.proportion_stiffness, False, sums)
     if terms.expectation_stiffness > 0.0:
-        cost += _expectation_cost(terms, parameters, sums)
+        for k in range(3):
+            rows = np.zeros((STEP_LENGTH + 1, 1))
+            rows[k], rows[STEP_LENGTH] = 1.0, logs[k] - math.log(terms.expected[k])
+            cost += _add(rows * terms.expectation_stiffness, True, sums)
     if terms.roundness_stiffness > 0.0:
-        cost += _roundness_cost(terms, parameters, sums)
+        rows = np.zeros((STEP_LENGTH + 1, 2))
+        rows[0, 0], rows[1, 0], rows[STEP_LENGTH, 0] = 1.0, -1.0, logs[0] - logs[1]
+        rows[4, 1], rows[STEP_LENGTH, 1] = -1.0, 1.0 - parameters[4]
+        cost += _add(rows * terms.roundness_stiffness, True, sums, 3.0)
+    if terms.taper_stiffness > 0.0:
+        rows = np.zeros((STEP_LENGTH + 1, 2))
+        rows[11, 0], rows[12, 1], rows[STEP_LENGTH] = 1.0, 1.0, parameters[8:]
+        cost += _add(rows * terms.taper_stiffness, False, sums)
     if terms.hull_directions.shape[0] > 0:
         cost += hull_cost(terms, parameters, rotation, sums)
-    if terms.taper_stiffness > 0.0:
-        for k in range(2):
-            slope = terms.taper_stiffness * terms.taper_stiffness * parameters[8 + k]
-            cost += slope * parameters[8 + k]
-            sums[11 + k, 11 + k] += terms.taper_stiffness * terms.taper_stiffness
-            sums[STEP_LENGTH, 11 + k] += slope
-    if terms.volume_price > 0.0:
-        for k in range(3):
-            cost += terms.volume_price * math.log(parameters[k])
-            sums[STEP_LENGTH, k] += 0.5 * terms.volume_price
     return cost
 
 
 @kernel
-def _plane_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
-    down = np.empty((1, 3))
-    down[0] = -terms.plane[:3]
-    rows = _support_rows(down, terms.plane[3:], parameters, rotation)
-    below = rows[STEP_LENGTH, 0]
-    s = terms.plane_stiffness if below > 0.0 else terms.gap_stiffness
-    square = s * s * below * below
-    cost = square if below > 0.0 else math.log1p(square)
-    rows *= s if below > 0.0 else s / math.sqrt(1.0 + square)
-    add_block(rows, 1, sums)
-    return cost
-
-
-@kernel
-def _rest_cost(terms: Terms, rotation: np.ndarray, sums: np.ndarray) -> float:
-    n = terms.plane[:3] @ rotation
-    upright = np.argmax(np.abs(n))
-    s = terms.rest_stiffness
-    square = (n @ n - n[upright] * n[upright]) * s * s
-    row = np.zeros(STEP_LENGTH + 1)
-    for k in range(3):
-        if k != upright:
-            row[:] = 0.0
-            after, before = (k + 1) % 3, (k + 2) % 3
-            row[8 + before], row[8 + after], row[STEP_LENGTH] = n[after], -n[before], n[k]
-            add_row(row * s / math.sqrt(1.0 + square), sums)
-    return math.log1p(square)
+def _add(rows: np.ndarray, has_tails: bool, sums: np.ndarray, factor: float = 1.0) -> float:
+    """The cost of residuals, the last row, below their derivatives: their squares, or Cauchy's loss of them together,
+    times a factor."""
+    square = 0.0
+    for residual in rows[STEP_LENGTH]:
+        square += residual * residual
+    if has_tails:
+        rows *= math.sqrt(factor / (1.0 + square))
+        square = factor * math.log1p(square)
+    add_block(rows, rows.shape[1], sums)
+    return square
 
 
 @kernel
 def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """Cost |W (h - b)|^2 of the hull."""
-    count = terms.hull_directions.shape[0]
     rows = _support_rows(terms.hull_directions, terms.hull_support, parameters, rotation)
-    whitened = rows @ terms.hull_root.T
-    square = 0.0
-    for j in range(count):
-        square += whitened[STEP_LENGTH, j] * whitened[STEP_LENGTH, j]
-    add_block(whitened, count, sums)
-    return square
+    return _add(rows @ terms.hull_root.T, False, sums)
 
 
 @kernel
@@ -186,44 +177,3 @@ def _support_rows(
         rows[8, j], rows[9, j], rows[10, j] = hy * n2 - hz * n1, hz * n0 - hx * n2, hx * n1 - hy * n0
         rows[STEP_LENGTH, j] += rows[5, j] * t1 + rows[6, j] * t2 + rows[7, j] * t3 + h
     return rows
-
-
-@kernel
-def _proportion_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
-    mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
-    cost, square = 0.0, terms.proportion_stiffness * terms.proportion_stiffness
-    for k in range(3):
-        apart = math.log(parameters[k]) - mean
-        cost += square * apart * apart
-        sums[STEP_LENGTH, k] += square * apart
-        for j in range(k + 1):
-            sums[k, j] += square * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
-    return cost
-
-
-@kernel
-def _expectation_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
-    cost, s = 0.0, terms.expectation_stiffness
-    for k in range(3):
-        residual = s * math.log(parameters[k] / terms.expected[k])
-        above = 1.0 + residual * residual
-        cost += math.log(above)
-        sums[k, k] += s * s / above
-        sums[STEP_LENGTH, k] += s * residual / above
-    return cost
-
-
-@kernel
-def _roundness_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
-    s = terms.roundness_stiffness
-    oval, square = s * math.log(parameters[0] / parameters[1]), s * (1.0 - parameters[4])
-    above = 1.0 + oval * oval + square * square
-    slope = 3.0 * s / above
-    sums[0, 0] += s * slope
-    sums[1, 0] -= s * slope
-    sums[1, 1] += s * slope
-    sums[4, 4] += s * slope
-    sums[STEP_LENGTH, 0] += slope * oval
-    sums[STEP_LENGTH, 1] -= slope * oval
-    sums[STEP_LENGTH, 4] -= slope * square
-    return 3.0 * math.log(above)

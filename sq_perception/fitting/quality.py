@@ -27,9 +27,10 @@ import numpy as np
 from sq_perception.fitting.cost import SAMPLE, STEP_LENGTH, Ray, Terms
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
+from sq_perception.fitting.observation import OUTLIER_SHARE, span
 from sq_perception.fitting.priors import hull_cost, hull_distances
 from sq_perception.fitting.residuals import RENDERED, evaluate
+from sq_perception.fitting.starts import enclosing_box
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
@@ -224,13 +225,13 @@ def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
     return np.clip(seen / (2 * half * (1 - 2 * OUTLIER_SHARE)), 0.0, 1.0)
 
 
-def fail(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
-    """The result where no body can be fitted: a box around what was seen."""
-    points = observation.points
-    distance = np.abs(body.sampson_distance(points))
+def fail(points: np.ndarray, thinnest: float, noise: float, reason: str, began: float) -> Fit:
+    """The result where no body can be fitted to points (n, 3): a box around them, no thinner than that."""
+    body = enclosing_box(points, thinnest)
+    distance = body.sampson_distance(points)
     return Fit(
         superquadric=body.canonical_form(), residual=float(np.sqrt(np.mean(distance**2))), status=Status.FAILED,
-        message=reason, noise=observation.sigma, inlier_share=0.0, milliseconds=(time.perf_counter() - began) * 1e3,
+        message=reason, noise=noise, inlier_share=0.0, milliseconds=(time.perf_counter() - began) * 1e3,
     )
 
 

@@ -32,7 +32,7 @@ from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.options import finite_points, limits
 from sq_perception.fitting.residuals import CLASSIC
-from sq_perception.fitting.starts import reason_to_fail
+from sq_perception.fitting.starts import principal_axes, reason_to_fail, three_orders
 from sq_perception.geometry import rotation as quaternions
 
 _MOST_POINTS = 1000
@@ -108,11 +108,9 @@ def moment_start(points: np.ndarray) -> State:
     """The ellipsoid along the principal axes of the points (n >= 1, 3)."""
     centroid = points.mean(axis=0)
     centred = points - centroid
-    moments, axes = np.linalg.eigh(centred.T @ centred)
-    lone = 2 if moments[2] - moments[1] > moments[1] - moments[0] else 0
-    axes = axes[:, [(lone + 1) % 3, (lone + 2) % 3, lone]]
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
+    scatter = centred.T @ centred
+    moments = np.linalg.eigvalsh(scatter)
+    axes = three_orders(principal_axes(scatter))[2 if moments[2] - moments[1] > moments[1] - moments[0] else 0]
     half = np.ptp(centred @ axes, axis=0) / 2
     half = np.maximum(half, max(1e-3 * float(half.max()), 1e-6))
-    return State(np.concatenate([half, [1.0, 1.0], centroid, [0.0, 0.0]]), np.ascontiguousarray(axes), math.inf, 0)
+    return State(np.concatenate([half, [1.0, 1.0], centroid, [0.0, 0.0]]), axes, math.inf, 0)

@@ -72,8 +72,7 @@ def reason_to_fail(points: np.ndarray, count: int, of: str) -> str:
 def principal(points: np.ndarray) -> list[State]:
     """Boxes along the principal axes of the points, for each choice of z."""
     axes = principal_axes(_scatter(points))
-    low, high = span(points, axes.T).T
-    return _ordered(low, high, axes)
+    return boxes(*span(points, axes.T).T, axes)
 
 
 def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
@@ -81,7 +80,7 @@ def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
     axes = standing_axes(points, plane[:3])
     low, high = span(points, axes.T).T
     low[2] = min(float(-plane[3] * plane[:3] @ axes[:, 2]), high[2] - 1e-4)
-    return _ordered(low, high, axes)
+    return boxes(low, high, axes)
 
 
 def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -113,9 +112,9 @@ def _scatter(points: np.ndarray) -> np.ndarray:
     return np.asarray(centred.T @ centred)
 
 
-def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]:
+def boxes(low: np.ndarray, high: np.ndarray, axes: np.ndarray, exponent: float = _BOX_EXPONENT) -> list[State]:
     """The box from ``low`` to ``high`` along the axes (columns), for each choice of z."""
-    parameters = np.full((len(ORDERS), PARAMETERS), _BOX_EXPONENT)
+    parameters = np.full((len(ORDERS), PARAMETERS), exponent)
     parameters[:, :3] = np.maximum((high - low) / 2, 1e-6)[ORDERS]
     parameters[:, 5:8] = axes @ ((low + high) / 2)
     parameters[:, 8:] = 0.0
@@ -237,13 +236,13 @@ def turned(state: State) -> State:
     return State(parameters, np.ascontiguousarray(state.rotation @ EIGHTH_TURNS[2]), math.inf, state.iterations)
 
 
-def other_orders(state: State) -> list[State]:
+def other_orders(state: State, exponent: float = START_EXPONENT) -> list[State]:
     """Bodies of the same box with each of its other axes as z."""
     found = []
     for order in three_orders(np.eye(3))[:2]:
         parameters = state.parameters.copy()
         parameters[:3] = order.T @ parameters[:3]
-        parameters[3:5] = START_EXPONENT
+        parameters[3:5] = exponent
         found.append(State(parameters, np.ascontiguousarray(state.rotation @ order), math.inf, state.iterations))
     return found
 

@@ -2,8 +2,8 @@
 
 Residuals run along the true rays of the pixels, so that one code serves orthographic and pinhole cameras: the object's
 pixels pull the surface onto what they measured, the pixels beside the object keep the body out of the space they saw to
-be empty.  docs/surface_fit.md derives the cost; :mod:`sq_perception.fitting.course` has its two models of an object,
-:mod:`sq_perception.fitting.valleys` what other bodies the image allows.
+be empty.  docs/surface_fit.md derives the cost, :mod:`sq_perception.fitting.multistart` states it for an object and
+searches, :mod:`sq_perception.fitting.valleys` tells what other bodies the image allows.
 
 Which model
 -----------
@@ -18,6 +18,17 @@ equally probable, as far as the image does not tell:
 
 What a camera sees has the standard deviations of things, whichever model its body is of.
 
+How much a thing misfits is estimated with its body: with c the mean loss of its rays it counts as INDEPENDENT / max(1,
+c / EXPLAINED) of them, since the likelihood maximised over an unknown variance divides by the variance found.  For the
+covariance they count as fewer by the same factor once more: larger errors extend over larger parts, such as a neck, a
+spout or a dent.
+
+The outline
+-----------
+Free rays beside the mask show where a body ends.  If the mask lost its edge (sensors lose what they see at grazing
+angles), the body covers pixels that were taken for free all around it: those are left out.  What the body then still
+covers tells the outline's standard deviation.
+
 Frames and units: optical frame, metres, radians.
 """
 
@@ -25,22 +36,34 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
 
-from sq_perception.fitting import course, starts, valleys
-from sq_perception.fitting.fit import Fit
+from sq_perception.fitting import starts, valleys
+from sq_perception.fitting.cost import SAMPLE, Rays
+from sq_perception.fitting.fit import INLIER, Fit
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.multistart import Problem, Solution
-from sq_perception.fitting.observation import Crop, Observation
+from sq_perception.fitting.multistart import (
+    FINAL_TOLERANCE,
+    HUBER,
+    SLACK,
+    SUPERQUADRIC,
+    THING,
+    Problem,
+    Solution,
+    by_cost,
+    within_doubt,
+)
+from sq_perception.fitting.observation import BAND_PIXELS, Crop, Observation
 from sq_perception.fitting.options import MODEL_ERROR, FitOptions, check_plane
 from sq_perception.fitting.priors import HullPrior
 from sq_perception.fitting.quality import WEAK_SHARE, Alternative, assess, fail
-from sq_perception.geometry.quantiles import deviation
+from sq_perception.fitting.residuals import mean_loss, penetration
+from sq_perception.geometry.quantiles import deviation, quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import DIRECTIONS
 from sq_perception.imaging import raycast
@@ -53,13 +76,22 @@ _FINE_NOISE = 0.1
 """Noise, as a share of how far things stray from superquadrics, below which a superquadric is sought too: a thing's
 body may then leave more than the noise even of a true superquadric.  Under more noise it left 0.5 to 0.8 of it on
 true superquadrics, and 1.2 and more on things of benchmarks/household_things."""
-_MODEL_SHARE = 0.04
-"""How far a small thing may stray, as a share of the side of a square whose area is that of its pixels: household
-things of 6 cm and more stray by :data:`~sq_perception.fitting.options.MODEL_ERROR`, and no more."""
 _NOISE_ALONE = 1.09
 """Mean squared residual up to which a thing is taken for a superquadric: noise alone, which is known to 4 % where lines
 are missing.  Things that left more got worse bodies as superquadrics; under a time-of-flight camera, which mixes depths
 at edges, nearly all do."""
+EXPLAINS = 1.4
+"""Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
+not finished.  Chosen on benchmarks/single_body."""
+_EXPLAINED = 0.5
+"""Mean loss up to which a thing counts as INDEPENDENT rays: what cartons and cans leave."""
+SPREAD = 2.5**2
+"""Factor of the covariance of what a camera saw where no hull is predicted: errors of residuals are alike."""
+_FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
+"""Object rays of the last stage, and most of them under much noise: a depth error of a third of a pixel's width
+averages out to a two hundredth.  Chosen on benchmarks/single_body."""
+_SHRUNK = 0.25
+"""Depth, in pixels: a body that covers half of the free pixels beside the mask this deep is larger than its mask."""
 _UNFINISHED = 1.06
 """Mean squared residual up to which a search that the time budget ended has come near the noise: bodies above it
 typically err by 5 to 40 standard deviations."""
@@ -113,8 +145,7 @@ def fit(
     solution = _solve(task)
     if solution is None:
         observation = crop.observe(options.model_error or 0.0, options.nan_is_empty, options.plane)
-        body = starts.enclosing_box(observation.points, observation.footprint)
-        return fail(body, observation, _why_not(observation), began)
+        return fail(observation.points, observation.footprint, observation.sigma, _why_not(observation), began)
     return assess(solution, began)
 
 
@@ -141,8 +172,12 @@ class _Task:
 
     @cached_property
     def model_error(self) -> float:
-        """How far the object strays from a superquadric if it is a thing, metres."""
-        return min(MODEL_ERROR, _MODEL_SHARE * self.crop.footprint * math.sqrt(np.count_nonzero(self.crop.mask)))
+        """How far the object strays from a superquadric if it is a thing, metres.
+
+        Household things of 6 cm and more stray by no more than ``MODEL_ERROR``, small ones by a share of the side of a
+        square whose area is that of their pixels.
+        """
+        return min(MODEL_ERROR, 0.04 * self.crop.footprint * math.sqrt(np.count_nonzero(self.crop.mask)))
 
     @property
     def is_fine(self) -> bool:
@@ -155,7 +190,7 @@ class _Task:
         if _why_not(observation):
             return None
         check_plane(observation.points, self.options.plane)
-        return course.problem_of(observation, self.options, self.began + self.options.time_budget)
+        return Problem.of(observation, self.options, self.began + self.options.time_budget)
 
 
 def _solve(task: _Task) -> Solution | None:
@@ -171,51 +206,107 @@ def _solve(task: _Task) -> Solution | None:
         if exactly is None or exactly.misfit >= _NOISE_ALONE or exactly.unsure().max() > WEAK_SHARE:
             return thing
         more = (*exactly.alternatives, Alternative(thing.state, _AS_A_THING))
-        return exactly.annotate(alternatives=more, spread_factor=course.SPREAD)
+        return exactly.annotate(alternatives=more, spread_factor=SPREAD)
     exactly = _fit_superquadric(task, [])
     if exactly is None or exactly.problem.late:
         return exactly
     may_stray = task.crop.camera.is_pinhole and not task.is_fine and not task.fills_image
-    if exactly.misfit < (_NOISE_ALONE if may_stray else course.EXPLAINS):
-        return exactly.annotate(spread_factor=course.SPREAD) if may_stray else exactly
+    if exactly.misfit < (_NOISE_ALONE if may_stray else EXPLAINS):
+        return exactly.annotate(spread_factor=SPREAD) if may_stray else exactly
     left = deviation(np.abs(exactly.distances))
     return _fit_thing(task, task.model_error if may_stray else left, [exactly.state, *task.starts()])
 
 
 def _fit_thing(task: _Task, model_error: float, starts_: list[State]) -> Solution | None:
-    """The most probable body of a thing, from given bodies and boxes."""
+    """The most probable body of a thing, its misfit estimated with it, from given bodies and boxes."""
     problem = task.problem(model_error)
     if problem is None:
         return None
     points, plane = problem.observation.points, task.options.plane
     boxes = starts.principal(points) if plane is None else starts.on_plane(points, plane)
-    solution = course.fit_thing(problem, [*starts_, *boxes])
-    if not solution.problem.has_hull and not problem.late:
+    found = problem.straight().search([*starts_, *boxes], THING)
+    misfit = max(1.0, _mean_loss(problem, found[0]) / _EXPLAINED)
+    if misfit > 1.0 and problem.has_hull:
+        problem = replace(problem, independent=(problem.independent or 0.0) / misfit)
+        found = found if problem.late else problem.search(found, THING[1:])
+    rays = problem.draw(task.options.pixels or SAMPLE, 0.3)
+    spread = 1.0 if problem.has_hull else SPREAD
+    solution = Solution(problem, problem.descend(found[0], rays, 30), rays, spread_factor=spread)
+    if problem.has_hull and not problem.late:
+        solution = _straighten(solution)
+    left = _mean_loss(problem, solution.state)
+    solution = replace(solution, rays=rays.scale(1 / max(1.0, left / _EXPLAINED)))
+    # As far off as noise reaches at most: points of a bowl or a pair of pliers typically are.
+    if left > HUBER * (2 * INLIER - HUBER):
+        solution = solution.annotate(notes=("like the convex hull of the object",), as_hull=True)
+    if not problem.has_hull and not problem.late:
         solution = valleys.add_oval(valleys.weigh_open_sizes(solution))
     return solution if problem.late else valleys.lengthen_open_ends(solution)
 
 
+def _straighten(solution: Solution) -> Solution:
+    """The solution without a taper that hardly lowers its cost."""
+    straight = solution.problem.straight()
+    state = straight.descend(solution.state, solution.rays, 30)
+    is_as_good = state.cost < solution.state.cost + SLACK
+    return replace(solution, problem=straight, state=state) if is_as_good else solution
+
+
+def _mean_loss(problem: Problem, body: State) -> float:
+    """Mean loss of the object's rays: c of the module."""
+    return mean_loss(problem.observation.sample, problem.terms.huber, body.parameters, body.rotation)
+
+
 def _fit_superquadric(task: _Task, first: list[State], patient: bool = True) -> Solution | None:
-    """The best superquadric; if not ``patient``, None where its cheapest starts explain the image not."""
+    """The best superquadric from groups of starts, as many as it takes to explain the image; where none does the
+    nearest one, or None if not ``patient``: then only the cheapest are tried."""
     problem = task.problem(0.0)
     if problem is None:
         return None
-    observation = problem.observation
-    groups: list[Callable[[], Sequence[State]]] = [lambda: [*first, *task.given]]
-    symmetric = starts.groups(observation)
-    groups.append(lambda: next(symmetric))
-    if task.later is not None:
-        groups.append(task.later)
-    if patient:
-        groups += [lambda: next(symmetric, [])] * 4
-    solution = course.fit_superquadric(problem, groups, patient)
-    if solution is None:
-        return None
+    enough = EXPLAINS * problem.floor(SUPERQUADRIC[-1].rays)
+    finalists: list[State] = []
+    for group in filter(None, _groups(task, first, problem.observation, patient)):
+        finalists = within_doubt([*finalists, *problem.search(group, SUPERQUADRIC)])[: SUPERQUADRIC[-1].kept]
+        if problem.late or finalists[0].cost < enough:
+            solution = _finish(problem, finalists)
+            break
+    else:
+        return Solution(problem, finalists[0], problem.draw(SAMPLE, 0.3)) if patient else None
     for step in (valleys.explore, valleys.weigh_depths, valleys.lengthen_open_ends, valleys.weigh_open_sizes):
-        if solution.problem.late or solution.misfit > course.EXPLAINS:
+        if solution.problem.late or solution.misfit > EXPLAINS:
             break
         solution = step(solution)
     return solution.annotate(is_unfinished=solution.problem.late and solution.misfit > _UNFINISHED)
+
+
+def _groups(task: _Task, first: list[State], observation: Observation, patient: bool) -> Iterator[list[State]]:
+    """Groups of starts of a superquadric, the cheapest first."""
+    yield [*first, *task.given]
+    symmetric = starts.groups(observation)
+    yield next(symmetric)
+    if task.later is not None:
+        yield task.later()
+    if patient:
+        yield from symmetric
+
+
+def _finish(problem: Problem, finalists: Sequence[State]) -> Solution:
+    """The best of the finalists on all rays, enough that the noise of their mean is well below a pixel's width; the
+    precision of the outline is read from the misfit of their favourite."""
+    favourite, *others = finalists
+    if not problem.late:
+        problem, favourite = drop_lost_edge(problem, favourite)
+    # The fewest rays average out a noise of 0.3 pixel widths; their number grows with its square.
+    ratio = problem.observation.sigma / (0.3 * problem.observation.footprint)
+    enough = int(np.clip(_FINAL_RAYS * ratio**2, _FINAL_RAYS, _MOST_FINAL_RAYS))
+    rays = problem.draw(problem.options.pixels or enough, 0.3)
+    few = problem.draw(enough // 4, 0.3)
+    problem, favourite = sharpen_outline(problem, favourite, rays.free, few)
+    settled = by_cost(problem.descend(state, few) for state in [favourite, *others])
+    # Few rays do not tell these apart.
+    near = [state for state in settled if state.cost <= settled[0].cost + SLACK]
+    refined = by_cost(problem.refine(state, rays) for state in (near[:1] if problem.late else near))
+    return Solution(problem, refined[0], rays)
 
 
 def _is_explained(solution: Solution, noise: float) -> bool:
@@ -238,6 +329,62 @@ def warm_up() -> None:
         fit(depth, mask, camera, options=FitOptions(plane=plane))
         fit(depth, mask, camera, options=FitOptions(plane=plane, model_error=0.0025, hull=hull))
         fit(depth, mask, camera, start=body)
+
+
+# The outline of a superquadric
+
+
+def drop_lost_edge(problem: Problem, state: State) -> tuple[Problem, State]:
+    """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
+    full = problem.observation
+    if _depth_inside(problem, state, full.ring(1)) < _SHRUNK:
+        return problem, state
+    problem = replace(problem, observation=full.beyond(BAND_PIXELS))
+    state = problem.descend(state, problem.draw(_FINAL_RAYS, 0.6), tolerance=FINAL_TOLERANCE)
+    rings = (k for k in range(1, BAND_PIXELS + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
+    band = next(rings, BAND_PIXELS + 1) - 1
+    return replace(problem, observation=full.beyond(band) if band > 0 else full), state
+
+
+def sharpen_outline(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
+    """Estimate the outline's precision from a body's misfit to free rays, and again from the better body it allows.
+
+    It does not fall below a pixel: else pixels that miss a body would cost next to nothing, and it might leave them.
+    """
+    sigma, before = _outline_sigma(problem, state, free), math.inf
+    while True:
+        sigma = min(sigma, problem.observation.footprint)
+        if not sigma < 0.7 * before or problem.late:  # so that it ends for any sigma
+            return problem, state
+        problem = problem.with_terms(outline_stiffness=1 / sigma)
+        state = problem.descend(state, rays)
+        before, sigma = sigma, _outline_sigma(problem, state, free)
+
+
+def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
+    """Depth, in pixels, to which the body covers half of these free pixels.
+
+    Half: a body that is merely too long covers those around the mask on one side only.
+    """
+    rays = problem.observation.free_rays_of(pixels)
+    if len(rays) == 0:
+        return 0.0
+    depth = penetration(rays, problem.terms, state.parameters, state.rotation)
+    return quantile(depth, 0.5) / problem.observation.footprint
+
+
+def _outline_sigma(problem: Problem, state: State, free: np.ndarray) -> float:
+    """Standard deviation of the outline, metres, from how far the body reaches into free rays beside the mask."""
+    # A perfect one covers exactly the centres of the mask's pixels: a uniform error of up to half a pixel.
+    sharp = problem.observation.footprint / math.sqrt(12)
+    if len(free) == 0:
+        return sharp
+    depth = penetration(free, problem.terms, state.parameters, state.rotation)
+    reached = depth[depth > 0]
+    return max(sharp, float(np.sqrt(np.mean(reached**2)))) if len(reached) else sharp
+
+
+# Arguments
 
 
 def _check_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -31,16 +31,7 @@ import numpy as np
 from sq_perception.fitting import starts
 from sq_perception.fitting.cost import SAMPLE, Ray, Rays
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.multistart import (
-    SETTLE,
-    SIGNIFICANT,
-    SLACK,
-    Problem,
-    Solution,
-    alike,
-    by_cost,
-    distinct,
-)
+from sq_perception.fitting.multistart import SIGNIFICANT, SLACK, Problem, Solution, alike, by_cost, distinct
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.quality import Alternative, undetermined
 from sq_perception.fitting.starts import resized
@@ -49,6 +40,8 @@ from sq_perception.imaging import regions
 _SETTLED, _UNSURE = 1.03, 0.01
 """Final mean squared residual, and standard deviation of a half size as a share of it, above either of which other
 valleys of the cost are tried; chosen on benchmarks/single_body."""
+_FEW = 300, 0.2
+"""Object rays on which other bodies are settled, and where their draw begins: others than those of the search."""
 _OTHER_SIZES = (0.5, 1.4)
 """Factors of the half size of rivals."""
 _FACE_SHARE = 0.04
@@ -90,7 +83,9 @@ def explore(solution: Solution) -> Solution:
         sizes = best.parameters[axis] * np.array(_OTHER_SIZES)
         rivals = [*(resized(best, axis, size) for size in sizes), starts.turned(best), *starts.other_orders(best)]
         # On other rays the body may already find its way out of a shallow valley.
-        reference, *settled = problem.advance([best, *rivals], SETTLE)
+        few = problem.draw(*_FEW)
+        on_time = itertools.takewhile(lambda _: not problem.late, rivals)
+        reference, *settled = (problem.descend(state, few) for state in itertools.chain([best], on_time))
         near = [state for state in distinct(by_cost(settled)) if state.cost < reference.cost + SLACK]
         found = [problem.refine(state, rays) for state in near if not alike(state, reference)]
         better = min(found, key=lambda state: state.cost, default=best)
@@ -141,7 +136,7 @@ def weigh_open_sizes(solution: Solution) -> Solution:
         problem = problem.with_terms(expectation_stiffness=1 / _EXPECTATION_SIGMA, expected=extents)
         rivals += [resized(state, k, float(extents[k])) for k in weak]
         notes = (*notes, "half sizes weighed against a prediction")
-    few = problem.draw(SETTLE.rays, SETTLE.offset)
+    few = problem.draw(*_FEW)
     few = few.scale(rays.weight / few.weight)
     settled = by_cost(problem.descend(rival, few) for rival in rivals)
     return replace(solution, problem=problem, state=problem.refine(settled[0], rays), notes=notes)

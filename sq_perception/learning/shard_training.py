@@ -20,7 +20,7 @@ thing, and the standard deviation of error / sigma, which should be 1.
 The network of masks
 --------------------
 Batches are mirrored or turned by a quarter at random, and a view is shown now and then as if there were no support
-plane, or no other segments.
+plane, no other segments, or no readings where a dark or shiny label is.
 
     loss = sum_cells w cross entropy(l, truth) / sum_cells w,    w = 1 within the segment, AROUND beside it,
                                                                  0 where nothing was measured
@@ -44,7 +44,7 @@ from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file
 from sq_perception.geometry.union import mirrored
-from sq_perception.imaging.segment_view import HEIGHT, OTHERS, PLANE, SEGMENT
+from sq_perception.imaging.segment_view import HEIGHT, MEASURED, NEARNESS, OTHERS, PLANE, SEGMENT
 from sq_perception.learning import checkpoint
 from sq_perception.learning.inference import check_device
 from sq_perception.learning.network_config import mirror_planes
@@ -57,6 +57,8 @@ from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 AROUND = 0.5
 _KEPT_BACK = 0.1  # share of the views without their extent, without the plane, and without other segments
+_LABELLED = 0.4  # share of the views of masks with a label that a sensor does not see
+HIDDEN = (MEASURED, NEARNESS, HEIGHT, SEGMENT, OTHERS)  # channels that show nothing where there is no reading
 _AT_ONCE = 128  # views of a validation that are computed at once
 _IN_MEMORY = 2**30
 """Bytes of shards that are read at once, three times that while others are: as many views as a training of masks shows
@@ -254,16 +256,47 @@ def validate_masks(network: MaskNetwork, views: SegmentViews) -> dict[str, float
 
 def _mask_batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Images (b, CHANNELS, p, p) and their truth (b, p, p)."""
-    images = views.images[chosen].astype(np.float32)
+    images, truth = views.images[chosen].astype(np.float32), views.truth[chosen]
+    for k in np.flatnonzero(rng.random(len(chosen)) < _LABELLED):
+        hide_label(images[k], truth[k], rng)
     without_plane, alone = rng.random((2, len(chosen))) < _KEPT_BACK
     images[without_plane, :, :, HEIGHT] = images[without_plane, :, :, PLANE] = 0
     images[alone, :, :, OTHERS] = 0
-    truth = views.truth[chosen]
     if rng.random() < 0.5:
         images, truth = images[:, :, ::-1], truth[:, :, ::-1]
     if rng.random() < 0.5:
         images, truth = images.transpose(0, 2, 1, 3), truth.transpose(0, 2, 1)
     return images.transpose(0, 3, 1, 2), truth
+
+
+def hide_label(image: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> None:
+    """Take the readings of a band across a segment, or of a patch of it, from a view (p, p, CHANNELS) and its truth.
+
+    A band parts a segment: half of the time what is beyond it becomes another segment, as segmentations make of it.
+    """
+    cells = np.argwhere((image[..., SEGMENT] > 0) & (image[..., MEASURED] > 0))
+    if len(cells) < 30:
+        return
+    centred, grid = cells - cells.mean(axis=0), np.moveaxis(np.indices(truth.shape), 0, -1) - cells.mean(axis=0)
+    across, along = np.linalg.eigh(centred.T @ centred)[1].T
+    angle = rng.uniform(0, np.pi)
+    way = (along, across, np.array([np.cos(angle), np.sin(angle)]))[rng.choice(3, p=(0.45, 0.25, 0.3))]
+    place, beside = grid @ way, grid @ np.array([-way[1], way[0]])
+    extent, width = np.ptp(centred @ way), np.ptp(centred @ np.array([-way[1], way[0]]))
+    middle, half = extent * rng.uniform(-0.3, 0.3), extent * rng.uniform(0.03, 0.2)
+    hidden, is_band = np.abs(place - middle) < half, rng.random() < 0.65
+    if not is_band:
+        hidden &= np.abs(beside - width * rng.uniform(-0.3, 0.3)) < width * rng.uniform(0.15, 0.35)
+    of_thing = truth == YES if rng.random() < 0.7 else (image[..., SEGMENT] > 0) | (image[..., OTHERS] > 0)
+    gone = hidden & of_thing
+    for channel in HIDDEN:
+        image[gone, channel] = 0
+    truth[gone] = UNKNOWN
+    segment = image[..., SEGMENT] > 0
+    kept = segment & ((place < middle) == (rng.random() < 0.5))
+    sides = kept, segment & ~kept
+    if is_band and rng.random() < 0.5 and all(side.sum() >= 12 and (truth[side] == YES).mean() > 0.9 for side in sides):
+        image[..., SEGMENT], image[..., OTHERS] = kept, np.maximum(image[..., OTHERS], sides[1])
 
 
 THINGS = NetworkKind(

@@ -1,25 +1,35 @@
 """What benchmarks measure with: errors, hulls, segments, figures of a scene, cameras, and what they change and undo."""
 
+from pathlib import Path
+
 import ablation
+import cv2
 import fit_parts
 import household_things
 import numpy as np
 import public_frames
 import pytest
+import render_search
+import torch
 import tracking
 import two_cameras
 from camera_bias import far_side
 from common import hull_columns, tabletop
 from common.package_constants import constants, varied
+from python_process import run_python
+from render_search import search
 from scipy.spatial import ConvexHull
 from segmentation import score
+from unit_axis import soft_images
 
 from sq_perception import Fit, FrameRecovery, RecordedFrame, Recoverer, Recovery, Status, Superquadric
 from sq_perception.fitting.priors import HullPrior
 from sq_perception.geometry import metrics, rotation
 from sq_perception.geometry.mesh import mesh
 from sq_perception.geometry.union import DIRECTIONS
+from sq_perception.imaging import raycast, soft_render, unit_cube
 from sq_perception.segmentation.options import SegmentationOptions
+from sq_perception.simulation.scenes import thesis_bodies
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 from sq_perception.tracking.association import TURNS
 
@@ -93,8 +103,7 @@ def test_hull_points_span_the_hull() -> None:
 
 
 def test_a_thing_shows_no_more_than_it_would_alone() -> None:
-    scene = household_things.scene(0, None, 5)
-    shares = [placed.visible_share for placed in scene.placed]
+    shares = [placed.visible_share for placed in household_things.scene(0, None, 5).placed]
     assert len(shares) == 5
     assert 0 <= min(shares) < 1
     assert max(shares) <= 1
@@ -174,3 +183,49 @@ def test_defaults_of_options_get_other_values_and_their_own_ones_back() -> None:
         assert getattr(SegmentationOptions(), constant.field) < value
         constant.set(value)
     assert SegmentationOptions() == before
+
+
+IMPORT = """
+import os, sys
+before = dict(os.environ)
+sys.path.insert(0, sys.argv[1])
+for module in sys.argv[2:]:
+    __import__(module)
+    changed = {name: value for name, value in os.environ.items() if before.get(name) != value and "THREADS" in name}
+    if changed:
+        sys.exit(f"{changed} set by the import of {module}")
+"""
+READ = "constants", "frame_time", "real_scenes", "segmentation", "single_body", "speed", "tracking"
+
+
+def test_an_import_leaves_the_number_of_threads_alone(repository: Path) -> None:
+    # Numba refuses to compile once its threads run and NUMBA_NUM_THREADS names another number.
+    run_python("-c", IMPORT, repository / "benchmarks", *READ)
+
+
+@pytest.mark.parametrize("name", ["hostile", "kills", "soak"])
+def test_helpers_of_the_tests_are_found(name: str, repository: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    run_python(repository / "benchmarks" / f"{name}.py", "--help")
+
+
+def test_error_is_that_of_the_two_renderers() -> None:
+    bodies = thesis_bodies(2, np.random.default_rng(0))
+    found = search(bodies, np.array([20.0, 117.3]), np.array([0.5, 4.82]), 32)
+    tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
+    soft = soft_images(tensors, soft_render.grid_points(32), 117.3, 0.5).numpy()
+    error = 0.0
+    for body, image in zip(bodies, soft, strict=True):
+        depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(32))
+        error += np.abs(unit_cube.grey_from_depth(depth) / 255 - image).mean() / 2
+    assert found.error[1, 0] == pytest.approx(error, rel=1e-4)
+    assert found.best == (117.3, 4.82, found.error.min())
+
+
+def test_the_script_prints_the_optimum_and_draws_the_map(capsys, tmp_path, monkeypatch) -> None:
+    picture = tmp_path / "map.png"
+    arguments = ["--bodies", "2", "--resolution", "16", "--steps", "4", "--picture", str(picture)]
+    monkeypatch.setattr("sys.argv", ["render_search.py", *arguments])
+    render_search.main()
+    assert "least MAE" in capsys.readouterr().out
+    assert cv2.imread(str(picture)) is not None

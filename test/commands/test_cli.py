@@ -1,4 +1,4 @@
-"""The command line: the public contract of its files, its exit codes, and a help that answers at once."""
+"""The command line: what its files promise, exit codes, clouds and meshes, and a help that answers at once."""
 
 import io
 import json
@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from python_process import run_python
 from recover_runs import run
 
@@ -213,17 +214,6 @@ def test_demo_without_ros_says_what_is_missing(monkeypatch, capsys):
     assert "demo needs ROS 2 in Python: pip install" in capsys.readouterr().err
 
 
-def test_author_renders(shared_data, tmp_path):
-    """The renders of the thesis' author come back with IoU above 0.97 (8 bit depth)."""
-    out = tmp_path / "out.json"
-    folder = shared_data / "author_renders"
-    assert recover(*sorted(folder.glob("*.bmp")), "--json", out) == 0
-    rows = np.loadtxt(folder / "labels.txt", delimiter=",", skiprows=1, usecols=range(1, 22))
-    found = [body_of(frame["superquadrics"][0]) for frame in strict(out.read_text())["frames"]]
-    truth = Superquadric(rows[:, 0:3] / 255, rows[:, 3:5], rows[:, 5:8] / 255, rows[:, -4:])
-    assert (thesis_iou(Superquadric.stack(found), truth) > 0.97).all()
-
-
 def test_a_file_that_is_called_like_the_standard_output_is_no_output(tmp_path, monkeypatch, capsys):
     """It is read where masks or the files of a bag are."""
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((30, 40), np.uint16))
@@ -289,3 +279,58 @@ def test_a_bar_that_no_terminal_shows_writes_nothing(capsys):
         bar.add_task("recovering", total=1)
         bar.console.line()
     assert capsys.readouterr().err == ""
+
+
+BODY = Superquadric([0.03, 0.04, 0.09], [0.2, 1.0], [0.02, -0.03, 0.6], [0.2, 0.1, 0.0, 1.0])
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> Path:
+    """A cloud of a whole object before where a camera might have been."""
+    path = tmp_path / "whole.ply"
+    trimesh.PointCloud(BODY.sample_surface(4000, np.random.default_rng(0))).export(path)
+    return path
+
+
+def test_a_cloud_becomes_a_line_and_json(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out.json"
+    assert main.main(["fit", str(whole), "--json", str(out)]) == 0
+    assert "0 converged 80.0 x 60.0 x 180.0" in capsys.readouterr().out
+    document = json.loads(out.read_text())
+    assert document["format"] == "sq_perception.points"
+    (entry,) = document["files"]
+    (body,) = entry["superquadrics"]
+    assert entry["points"] == 4000
+    assert np.allclose(np.sort(body["size"]), np.sort(BODY.size), rtol=0.01)
+    assert np.allclose(body["translation"], BODY.translation, atol=1e-3)
+    assert np.shape(body["covariance"]) == (11, 11)
+
+
+def test_meshes_and_arrays_are_read_and_parts_found(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    trimesh.creation.cylinder(radius=0.03, height=0.1).export(tmp_path / "can.obj")
+    np.save(tmp_path / "cloud.npy", BODY.sample_surface(1000, np.random.default_rng(1)))
+    assert main.main(["fit", str(tmp_path / "can.obj"), str(tmp_path / "cloud.npy"), "--most", "3", "--json", "-"]) == 0
+    found = json.loads(capsys.readouterr().out)["files"]
+    assert [len(entry["superquadrics"]) for entry in found] == [1, 1]
+
+
+def test_what_cannot_be_read_is_said_and_the_rest_follows(whole, tmp_path, capsys) -> None:
+    broken = tmp_path / "broken.ply"
+    broken.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 9999999\nend_header\n")
+    assert main.main(["fit", str(broken), str(tmp_path / "none.stl"), str(tmp_path / "some.txt"), str(whole)]) == 1
+    shown = capsys.readouterr()
+    for name, reason in (("broken.ply", ""), ("none.stl", "No such file"), ("some.txt", ".stl")):
+        assert f"{name}: " in shown.err
+        assert reason in shown.err
+    assert "0 converged" in shown.out
+
+
+def test_a_plane_fails_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    np.save(tmp_path / "plane.npy", np.random.default_rng(2).random((500, 3)) * [1.0, 1.0, 0.0])
+    assert main.main(["fit", str(tmp_path / "plane.npy")]) == 0
+    assert "failed: all points lie on one plane" in capsys.readouterr().out
+
+
+def test_recover_sends_the_cloud_of_a_whole_object_here(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.main(["recover", str(whole), "--method", "symmetry"]) == 1
+    assert "sq-perception fit takes clouds of whole objects" in capsys.readouterr().err

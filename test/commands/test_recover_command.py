@@ -31,7 +31,6 @@ from sq_perception.recordings.inputs import RecordedInput, in_folder
 
 @pytest.fixture
 def validate(repository):
-    """Holds a document against the schema."""
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((repository / "sq_perception" / "recordings" / "result.schema.json").read_text())
     jsonschema.Draft202012Validator.check_schema(schema)
@@ -43,8 +42,7 @@ def body_of(entry):
 
 
 def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
-    names = ["f2.png", "f10.png", "f1.npz", "F3.PNG", "g.png"]
-    for k, name in enumerate(names):
+    for k, name in enumerate(["f2.png", "f10.png", "f1.npz", "F3.PNG", "g.png"]):
         (save_npz if name.endswith("npz") else save_png)(tmp_path / name, *([] if name.endswith("npz") else [500 + k]))
     camera_yaml(tmp_path / "camera.yaml", 300.0)
     (tmp_path / "notes.txt").touch()
@@ -421,8 +419,7 @@ def test_a_workspace_may_have_no_end(tmp_path, lowest):
     for _ in range(2):
         assert len(recover(tmp_path, tmp_path / "a.npz", *box)[0]["superquadrics"]) == 2
     options = json.loads((tmp_path / "out.jsonl").read_text().splitlines()[0])["options"]
-    expected = [-1, None if "-inf" in lowest else -1, float(lowest[2]), 1, 1, None]
-    assert options["workspace"] == expected
+    assert options["workspace"] == [-1, None if "-inf" in lowest else -1, float(lowest[2]), 1, 1, None]
 
 
 def test_a_message_is_one_printable_line(capsys):

@@ -81,8 +81,7 @@ def test_links_and_devices_are_written_through(tmp_path, option):
 @pytest.mark.parametrize("option", ["--json", "--jsonl", "--mcap", "--pictures", "--meshes"])
 def test_what_cannot_be_written_is_known_before_a_frame_is_computed(tmp_path, option, monkeypatch, capsys):
     monkeypatch.setattr(Recoverer, "recover", None)
-    frame = save_npz(tmp_path / "a.npz")
-    assert run(frame, option, "/proc/sys/out.mcap") == 2
+    assert run(save_npz(tmp_path / "a.npz"), option, "/proc/sys/out.mcap") == 2
     assert option in capsys.readouterr().err
 
 
@@ -109,7 +108,7 @@ def test_a_bag_that_was_begun_is_forgotten_where_the_page_cannot_be(tmp_path, mo
     assert not list(outputs.iterdir())
 
 
-def test_what_is_read_is_not_replaced(tmp_path, capsys):
+def test_no_output_takes_the_place_of_an_input_or_of_another(tmp_path, capsys):
     """Files that were named, and masks, cameras and the parts of a bag that are read for them."""
     frame, png = save_npz(tmp_path / "a.npz"), save_png(tmp_path / "b.png")
     camera = camera_yaml(tmp_path / "camera.yaml")
@@ -131,9 +130,6 @@ def test_what_is_read_is_not_replaced(tmp_path, capsys):
         assert run(*arguments) == 2
         assert "input" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in before} == before
-
-
-def test_no_output_takes_the_place_of_another(tmp_path, capsys):
     frame, out = save_npz(tmp_path / "a.npz"), tmp_path / "out.json"
     assert main.main(["recover", str(frame), "--json", str(out), "--jsonl", f"{tmp_path}/./out.json"]) == 2
     assert "--json, --jsonl: " in capsys.readouterr().err

@@ -42,7 +42,6 @@ def small_network(path: Path, **training: object) -> Path:
 
 
 def entry(name: str, loss: str | None, **changed: float) -> dict[str, Any]:
-    """A contestant of results.json."""
     return {"name": name, "loss": loss, "summary": {**FiguresOfMerit.of(LABELS, LABELS).summary(), **changed}}
 
 
@@ -89,8 +88,7 @@ class TestFigures:
         assert np.rad2deg(shortest_arc(LABELS.rotation, -turned)) == pytest.approx(360 - degrees, abs=1e-5)
 
     def test_what_was_not_recovered_has_iou_0_and_no_errors(self) -> None:
-        recovered = np.arange(40) % 4 > 0
-        found = FiguresOfMerit.of(LABELS, LABELS, recovered)
+        found = FiguresOfMerit.of(LABELS, LABELS, np.arange(40) % 4 > 0)
         assert found.summary()["iou_mean"] == pytest.approx(0.75)
         assert (found.summary()["recovered"], found.summary()["delta_a"]) == (30, 0)
         nothing = FiguresOfMerit.of(LABELS, LABELS, np.zeros(40, bool)).summary()
@@ -140,8 +138,7 @@ class TestContest:
 
     def test_a_network_recovers_what_the_recovery_recovers(self) -> None:
         """In batches and one by one: two ways to the same bodies."""
-        images = ThesisImages(6)
-        ((first, depths),) = images.chunks()
+        ((first, depths),) = ThesisImages(6).chunks()
         answers = network(checkpoint.resolve()).recover(first, depths)
         recoverer = Recoverer(method="network")
         for depth, flat in zip(depths, answers.bodies, strict=True):
@@ -152,8 +149,7 @@ class TestContest:
         assert (answers.milliseconds > 0).all()
 
     def test_an_empty_image_is_a_body_not_recovered(self) -> None:
-        images = ThesisImages(2)
-        ((first, depths),) = images.chunks()
+        ((first, depths),) = ThesisImages(2).chunks()
         depths[1] = np.nan
         for contestant in (network(checkpoint.resolve()), fit("symmetry")):
             bodies, _ = contestant.recover(first, depths)
@@ -219,8 +215,7 @@ def test_examples_are_chosen_by_rank() -> None:
         numbers = [number for group in groups.values() for number in group]
         assert len(set(numbers)) == len(numbers) == min(count, 9) or count in (2, 5)
         assert outcome.figures.iou[groups["best"][0]] == outcome.figures.iou.max()
-        ordered = outcome.figures.iou[numbers]
-        assert (np.diff(ordered) <= 0).all()
+        assert (np.diff(outcome.figures.iou[numbers]) <= 0).all()
     assert [len(group) for group in groups.values()] == [3, 3, 3]
     assert outcome.figures.iou[groups["median"][1]] == pytest.approx(np.median(outcome.figures.iou), abs=0.02)
     assert outcome.figures.iou[groups["worst"][-1]] == outcome.figures.iou.min()
@@ -234,8 +229,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, int]:
     bad = folder / "bad <&>.safetensors"
     bad.write_bytes(good.read_bytes()[:1000])
     arguments = ["--bodies", "20", "--fit-bodies", "6", "--models", str(good), str(bad), "--methods", "classic"]
-    code = main.main(["evaluate", *arguments, "--output", str(folder / "out")])
-    return folder / "out", code
+    return folder / "out", main.main(["evaluate", *arguments, "--output", str(folder / "out")])
 
 
 class TestCommand:

@@ -42,7 +42,6 @@ def drawn(figure):
 
 
 def one_picture(inches=(6.4, 4.8)):
-    """A figure and the axes that fill it."""
     figure = plots.new_figure(*inches)
     return figure, figure.add_axes((0, 0, 1, 1))
 
@@ -132,8 +131,7 @@ def test_figures_of_full_and_empty_frames(tmp_path):
 def test_numbers_of_a_body_in_the_cube_are_beside_each_other():
     camera = unit_cube.camera(96)
     depth, labels = shot(IN_CUBE, camera)
-    found = Recoverer(method="symmetry").recover(depth, camera, labels)
-    figure = recovery_figure(depth, camera, found)
+    figure = recovery_figure(depth, camera, Recoverer(method="symmetry").recover(depth, camera, labels))
     figure.canvas.draw()
     edges, exponents = (
         next(text for text in figure.axes[-1].texts if text.get_text().startswith(start)) for start in ("0.6", "e ")

@@ -1,7 +1,5 @@
 """The compiled residuals against their torch statement: values, and derivatives against autograd."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 
@@ -21,9 +19,7 @@ PLAIN = Terms(huber=np.inf, outline_huber=np.inf)
 SIGMA = 0.003
 
 
-def random_body(
-    rng: np.random.Generator, shape: tuple[float, float] | None = None, taper: tuple[float, float] = (0.0, 0.0)
-) -> Superquadric:
+def random_body(rng, shape=None, taper=(0.0, 0.0)) -> Superquadric:
     exponents = rng.uniform(0.1, 1.0, 2) if shape is None else np.array(shape)
     size, centre = rng.uniform(0.03, 0.1, 3), rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.6]
     return Superquadric(size, exponents, centre, quaternions.random(1, rng)[0], np.asarray(taper))
@@ -59,18 +55,15 @@ def expected_sums(body: Superquadric, residuals: Callable[[Superquadric], torch.
     return float(values @ values), np.concatenate([jacobian.T @ jacobian, (jacobian.T @ values)[None]])
 
 
-def assert_same(
-    stage: int,
-    rays: np.ndarray,
-    free: np.ndarray,
-    terms: Terms,
-    body: Superquadric,
-    expected: tuple[float, np.ndarray],
-    tolerance: float = 1e-5,
-) -> None:
-    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    state = State.of(body)
-    cost = evaluate(stage, rays, free, terms, state.parameters, state.rotation, rays[:, Ray.DEPTH].copy(), sums)
+def cost_of(stage, rays, free, terms, body) -> tuple[float, np.ndarray]:
+    """The cost, and the normal equations with the gradient in their last row."""
+    sums, state = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1)), State.of(body)
+    depth = rays[:, Ray.DEPTH].copy()
+    return evaluate(stage, rays, free, terms, state.parameters, state.rotation, depth, sums), sums
+
+
+def assert_same(stage, rays, free, terms, body, expected, tolerance=1e-5) -> None:
+    cost, sums = cost_of(stage, rays, free, terms, body)
     value, matrix = expected
     assert cost == pytest.approx(value, rel=tolerance, abs=1e-12)
     lower = np.tril(np.ones((STEP_LENGTH, STEP_LENGTH), bool))
@@ -81,6 +74,7 @@ def assert_same(
     assert (np.abs(sums[STEP_LENGTH, :STEP_LENGTH] - matrix[STEP_LENGTH]) / root).max() < 10 * tolerance
 
 
+LIMITS = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
 TAPERS = [(0.0, 0.0), (0.4, -0.3)]
 SHAPES = [None, (0.1, 0.1), (0.02, 0.05), (1.0, 1.0), (0.1, 1.0), (1.0, 0.1), (1.8, 1.5)]
 
@@ -88,9 +82,7 @@ SHAPES = [None, (0.1, 0.1), (0.02, 0.05), (1.0, 1.0), (0.1, 1.0), (1.0, 0.1), (1
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
 @pytest.mark.parametrize("taper", TAPERS)
-def test_point_residuals_and_derivatives(
-    taper: tuple[float, float], stage: int, shape: tuple[float, float] | None, rng: np.random.Generator
-) -> None:
+def test_point_residuals_and_derivatives(taper, stage, shape, rng) -> None:
     body = random_body(rng, shape, taper)
     points = body.sample_surface(60, rng) + rng.normal(0, 0.004, (60, 3))
     function = statement.classic if stage == CLASSIC else statement.sampson
@@ -101,8 +93,7 @@ def test_point_residuals_and_derivatives(
 @pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
 def test_point_residuals_on_the_axes(stage: int, rng: np.random.Generator) -> None:
     body = random_body(rng)
-    axes = np.concatenate([np.eye(3), -np.eye(3)]) * body.size * 1.02
-    points = np.asarray(body.to_parent(axes))
+    points = np.asarray(body.to_parent(np.concatenate([np.eye(3), -np.eye(3)]) * body.size * 1.02))
     function = statement.classic if stage == CLASSIC else statement.sampson
     expected = expected_sums(body, lambda moved: function(moved, torch.tensor(points)) / SIGMA)
     assert_same(stage, rays_to(points, pinhole=True), NO_RAYS, PLAIN, body, expected)
@@ -117,9 +108,7 @@ def visible_points(body: Superquadric, rng: np.random.Generator, pinhole: bool) 
 
 @pytest.mark.parametrize("shape", SHAPES[:5])
 @pytest.mark.parametrize(("pinhole", "taper"), zip([True, False], TAPERS, strict=True))
-def test_rendered_depth_and_derivatives(
-    pinhole: bool, taper: tuple[float, float], shape: tuple[float, float] | None, rng: np.random.Generator
-) -> None:
+def test_rendered_depth_and_derivatives(pinhole, taper, shape, rng) -> None:
     body = random_body(rng, shape, taper)
     rays = rays_to(visible_points(body, rng, pinhole), pinhole)
     rays[:, Ray.DEPTH] += rng.normal(0, 0.003, len(rays))
@@ -154,14 +143,10 @@ def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random
     rim = np.stack([np.cos(angle), np.sin(angle)], 1)
     extent = np.asarray(body.support(np.concatenate([rim, np.zeros((200, 1))], 1)))
     rays = rays_to(np.concatenate([rim * extent[:, None] * 1.01, np.full((200, 1), 0.5)], 1), pinhole=False)
-    terms = PLAIN._replace(outline_stiffness=1 / SIGMA)
-    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    state = State.of(body)
-    cost = evaluate(RENDERED, rays, NO_RAYS, terms, state.parameters, state.rotation, rays[:, Ray.DEPTH].copy(), sums)
+    cost, sums = cost_of(RENDERED, rays, NO_RAYS, PLAIN._replace(outline_stiffness=1 / SIGMA), body)
     assert cost > 0
     assert np.isfinite(cost)
-    gradient = sums[STEP_LENGTH, :STEP_LENGTH]
-    assert gradient[:3].min() < 0, "growing the body must lower the cost"
+    assert sums[STEP_LENGTH, :STEP_LENGTH][:3].min() < 0, "growing the body must lower the cost"
 
 
 def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
@@ -185,8 +170,7 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
     square = float(statement.leaning(as_torch(body), target).square().sum()) * 9
     rest = terms._replace(plane_stiffness=0.0, rest_stiffness=3.0)
     _, matrix = expected_sums(body, lambda moved: 3 * statement.leaning(moved, target) / np.sqrt(1 + square))
-    scaled = matrix.copy()
-    assert_same(SAMPSON, NO_RAYS, NO_RAYS, rest, body, (np.log1p(square), scaled))
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, rest, body, (np.log1p(square), matrix.copy()))
 
     even = PLAIN._replace(proportion_stiffness=2.0)
     assert_same(
@@ -208,42 +192,29 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
 
 
 def test_a_body_above_the_plane_pays_nothing(rng: np.random.Generator) -> None:
-    body = random_body(rng)
     terms = PLAIN._replace(plane=np.array([0.0, -1.0, 0.0, 1.0]), plane_stiffness=1000.0)
-    state = State.of(body)
-    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    no_depths = np.empty(0)
-    assert evaluate(SAMPSON, NO_RAYS, NO_RAYS, terms, state.parameters, state.rotation, no_depths, sums) == 0
+    assert cost_of(SAMPSON, NO_RAYS, NO_RAYS, terms, random_body(rng))[0] == 0
 
 
 def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
-    sphere = Superquadric([0.05] * 3, [1.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
-    state = State.of(sphere)
-    rays = rays_to(np.array([[0.0, 0.0, 0.44]]), pinhole=False)
-    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    ball = Superquadric([0.05] * 3, [1.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    rays, state = rays_to(np.array([[0.0, 0.0, 0.44]]), pinhole=False), State.of(ball)
     residual = 0.01 / SIGMA
     for huber, loss in ((10.0, residual**2), (2.0, 2 * 2.0 * residual - 4.0)):
-        terms = PLAIN._replace(huber=huber)
-        met = rays[:, Ray.DEPTH].copy()
-        cost = evaluate(SAMPSON, rays, NO_RAYS, terms, state.parameters, state.rotation, met, sums)
-        assert cost == pytest.approx(loss)
-    distance = surface_distance(rays, state.parameters, state.rotation)
-    assert distance[0] == pytest.approx(0.01)
+        assert cost_of(SAMPSON, rays, NO_RAYS, PLAIN._replace(huber=huber), ball)[0] == pytest.approx(loss)
+    assert surface_distance(rays, state.parameters, state.rotation)[0] == pytest.approx(0.01)
 
 
 def test_cost_never_rises_and_reaches_the_truth(rng: np.random.Generator) -> None:
     truth = random_body(rng)
-    points = truth.sample_surface(300, rng)
-    rays = rays_to(points, pinhole=False)
-    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
+    rays = rays_to(truth.sample_surface(300, rng), pinhole=False)
     step = rng.normal(0, 0.15, STEP_LENGTH) * np.r_[np.ones(5), [0.1] * 3, np.ones(3), [0.0] * 2]
-    moved = statement.moved(as_torch(truth), torch.tensor(step))
-    flat = np.asarray(moved.to_numbers().numpy())
+    flat = np.asarray(statement.moved(as_torch(truth), torch.tensor(step)).to_numbers().numpy())
     flat[3:5] = np.clip(flat[3:5], 0.1, 1.0)
     state = State.of(Superquadric.from_flat(flat))
     costs = []
     for _ in range(60):
-        state = minimize(SAMPSON, rays, NO_RAYS, PLAIN, state, limits, 1, 0.0)
+        state = minimize(SAMPSON, rays, NO_RAYS, PLAIN, state, LIMITS, 1, 0.0)
         costs.append(state.cost)
     assert all(after <= before * (1 + 1e-9) for before, after in itertools.pairwise(costs))
     assert costs[-1] < 1e-4 * costs[0]
@@ -264,13 +235,12 @@ def test_a_body_at_the_end_of_its_valley_takes_no_step(rng: np.random.Generator)
     """What a step promises tells that it is not worth a look: the body stays as it is, to the bit."""
     truth = random_body(rng, (0.4, 0.8))
     rays = rays_to(truth.sample_surface(300, rng) + rng.normal(0, SIGMA, (300, 3)), pinhole=False)
-    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
-    there = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 100, 1e-12)
-    again = minimize(SAMPSON, rays, NO_RAYS, PLAIN, there, limits, 100, 1e-6)
+    there = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), LIMITS, 100, 1e-12)
+    again = minimize(SAMPSON, rays, NO_RAYS, PLAIN, there, LIMITS, 100, 1e-6)
     assert again.iterations == there.iterations + 1
     np.testing.assert_array_equal(again.parameters, there.parameters)
     np.testing.assert_array_equal(again.rotation, there.rotation)
-    begun = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 100, 1e-6)
+    begun = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), LIMITS, 100, 1e-6)
     assert begun.cost == pytest.approx(there.cost, rel=1e-5)
 
 
@@ -278,8 +248,7 @@ def test_a_search_leaves_its_rays_as_they_were(rng: np.random.Generator) -> None
     """So that a cost does not depend on which bodies were looked at before."""
     truth = random_body(rng, (0.4, 0.8))
     rays = rays_to(visible_points(truth, rng, pinhole=True), pinhole=True)
-    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3, [0.0] * 2], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3, [0.0] * 2])
     before = rays.copy()
-    first, other = (minimize(RENDERED, rays, NO_RAYS, PLAIN, State.of(truth), limits, 5, 1e-6) for _ in range(2))
+    first, other = (minimize(RENDERED, rays, NO_RAYS, PLAIN, State.of(truth), LIMITS, 5, 1e-6) for _ in range(2))
     np.testing.assert_array_equal(rays, before)
     assert first.cost == other.cost

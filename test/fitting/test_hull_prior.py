@@ -1,7 +1,5 @@
 """A predicted support function in the fit: its derivatives, and the unseen side that it tells."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -50,8 +48,7 @@ def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rn
 
 def test_a_bottle_is_as_long_wide_and_high_as_its_hull_is_predicted() -> None:
     up = np.array([0.0, -0.8, -0.6])
-    axes = np.stack([[1.0, 0.0, 0.0], np.cross(up, [1.0, 0.0, 0.0]), up], axis=1)
-    turn = rotation.from_matrix(axes)
+    turn = rotation.from_matrix(np.stack([[1.0, 0.0, 0.0], np.cross(up, [1.0, 0.0, 0.0]), up], axis=1))
     parts = [
         Superquadric(np.array(size), np.array([0.2, 0.6]), np.array([0.0, 0.0, 0.6]) + height * up, turn)
         for size, height in (((0.045, 0.03, 0.05), 0.05), ((0.035, 0.024, 0.02), 0.11), ((0.015, 0.015, 0.03), 0.15))
@@ -141,23 +138,18 @@ def box_from_the_front() -> tuple[np.ndarray, np.ndarray, Superquadric, np.ndarr
     tilt = math.radians(12.0)
     normal = np.array([0.0, -math.cos(tilt), -math.sin(tilt)])
     axes = np.stack([[1.0, 0.0, 0.0], np.cross(normal, [1.0, 0.0, 0.0]), normal], axis=1)
-    from sq_perception.geometry import rotation as quaternions
-
-    body = Superquadric([0.04, 0.03, 0.06], [0.1, 0.1], [0.0, 0.02, 0.55], quaternions.from_matrix(axes))
+    body = Superquadric([0.04, 0.03, 0.06], [0.1, 0.1], [0.0, 0.02, 0.55], rotation.from_matrix(axes))
     plane = np.append(normal, -normal @ (body.translation - 0.06 * normal))
     shown, _ = raycast.render(body, CAMERA)
     mask = np.isfinite(shown)
     noise = np.random.default_rng(5).normal(0, 0.002, shown.shape)
     # Round corners and a bulge, as no superquadric has them.
     bulge = 0.004 * np.cos(np.linspace(-1.5, 1.5, shown.shape[1]))[None]
-    depth = np.where(mask, shown + noise - bulge, 1.5).astype(np.float32)
-    return depth, mask, body, plane
+    return np.where(mask, shown + noise - bulge, 1.5).astype(np.float32), mask, body, plane
 
 
 @pytest.mark.parametrize("deep", [0.02, 0.03, 0.05])
-def test_a_prediction_tells_the_depth_behind_a_front(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray], deep: float
-) -> None:
+def test_a_prediction_tells_the_depth_behind_a_front(box_from_the_front, deep) -> None:
     depth, mask, body, plane = box_from_the_front
     front = body.translation[2] - 0.03
     told_body = Superquadric([0.04, deep, 0.06], body.shape, [*body.translation[:2], front + deep], body.rotation)
@@ -165,13 +157,10 @@ def test_a_prediction_tells_the_depth_behind_a_front(
     found = surface_fit.fit(depth, mask, CAMERA, options=options)
     reach = found.superquadric.support(np.array([[0.0, 0.0, 1.0]]))[0]
     assert reach == pytest.approx(float(told_body.support(np.array([[0.0, 0.0, 1.0]]))[0]), abs=0.007)
-    height = found.superquadric.support(plane[None, :3])[0]
-    assert height == pytest.approx(0.06, abs=0.005)
+    assert found.superquadric.support(plane[None, :3])[0] == pytest.approx(0.06, abs=0.005)
 
 
-def test_a_vague_prediction_leaves_the_size_open(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
-) -> None:
+def test_a_vague_prediction_leaves_the_size_open(box_from_the_front) -> None:
     """What is predicted less surely comes out less surely: the deviation is that of the posterior."""
     depth, mask, body, plane = box_from_the_front
     widest = []
@@ -181,9 +170,7 @@ def test_a_vague_prediction_leaves_the_size_open(
     assert widest[1] > 1.5 * widest[0]
 
 
-def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(box_from_the_front, monkeypatch) -> None:
     """No superquadric explains it: none is sought from everywhere, and its far side is the predicted one."""
     _, mask, body, _ = box_from_the_front
     shown, _ = raycast.render(body, CAMERA)
@@ -197,9 +184,7 @@ def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
     assert found.superquadric.size.max() == pytest.approx(0.06, abs=0.01)
 
 
-def test_a_thing_cut_short_is_no_surer_than_one_with_time(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
-) -> None:
+def test_a_thing_cut_short_is_no_surer_than_one_with_time(box_from_the_front) -> None:
     """What no superquadric fits counts as fewer rays, whether or not there is time to go on."""
     depth, mask, body, plane = box_from_the_front
     dents = 0.012 * np.sin(np.linspace(0, 40, depth.shape[1], dtype=np.float32))
@@ -213,9 +198,7 @@ def test_a_thing_cut_short_is_no_surer_than_one_with_time(
     assert (by_length[0] > 0.9 * by_length[1]).all()
 
 
-def test_no_form_of_a_hull_is_compiled_for(
-    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
-) -> None:
+def test_no_form_of_a_hull_is_compiled_for(box_from_the_front) -> None:
     """A camera would wait for it: 12 s for single precision and read only arrays, 2 s for a whole number."""
     depth, mask, body, plane = box_from_the_front
     usual = told(body, 0.004)

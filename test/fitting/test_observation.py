@@ -1,7 +1,5 @@
 """Which pixels of a mask are taken for the object."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -40,9 +38,7 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
 
 @pytest.mark.parametrize("pixels", [1, 2, 3])
 @pytest.mark.parametrize("truth", [BOX, CAN], ids=["box", "can"])
-def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(
-    truth: Superquadric, pixels: int, rng: np.random.Generator
-) -> None:
+def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(truth, pixels, rng) -> None:
     """What is behind a thing goes on from its foot by way of the table, without a step."""
     depth, mask = image(truth, rng)
     fit = surface_fit.fit(depth, grown(mask, pixels), CAMERA, options=FitOptions(plane=TABLE))
@@ -58,18 +54,12 @@ def test_a_plane_before_the_object_is_refused(rng: np.random.Generator) -> None:
     surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=2 * TABLE))
 
 
-def test_a_right_mask_keeps_its_pixels_whatever_the_plane(rng: np.random.Generator) -> None:
+def test_right_pixels_stay_whatever_the_plane_and_where_most_of_a_thing_is_as_low_as_its_support(rng) -> None:
     depth, mask = image(BOX, rng)
     crop = Crop.around(depth, mask, CAMERA, None)
     assert crop is not None
     known, unknown = crop.observe(0.0025, None, TABLE), crop.observe(0.0025, None)
     np.testing.assert_array_equal(known.pixels, unknown.pixels)
-
-
-def test_a_thing_of_which_most_is_as_low_as_its_support_keeps_its_pixels(rng: np.random.Generator) -> None:
-    depth, mask = image(BOX, rng)
-    crop = Crop.around(depth, mask, CAMERA, None)
-    assert crop is not None
     above = TABLE - [0.0, 0.0, 0.0, 2 * HALF]  # a plane through its top
     assert len(crop.observe(0.0025, None, above).pixels) == len(crop.observe(0.0025, None).pixels)
 

@@ -1,7 +1,5 @@
 """The classic fit: exact on complete clouds, plausible on views, honest on bad input."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -29,17 +27,11 @@ def test_long_bodies_are_recovered_from_their_whole_surface(seed: int) -> None:
     assert fit.residual < 1e-4
 
 
-def test_sizes_follow_the_unit_of_length(rng: np.random.Generator) -> None:
+def test_the_body_moves_with_its_points_and_its_sizes_follow_the_unit_of_length(rng: np.random.Generator) -> None:
     points = random_body(rng).sample_surface(400, rng)
-    small, large = solina_bajcsy.fit(points), solina_bajcsy.fit(points * 1000)
-    assert large.superquadric.size == pytest.approx(small.superquadric.size * 1000, rel=1e-3)
-
-
-def test_rigid_motion_moves_the_result(rng: np.random.Generator) -> None:
-    truth = random_body(rng)
-    points = truth.sample_surface(400, rng)
     turn, shift = quaternions.random(1, rng)[0], np.array([0.3, -0.2, 1.0])
-    still = solina_bajcsy.fit(points).superquadric
+    still, large = (solina_bajcsy.fit(each).superquadric for each in (points, points * 1000))
+    assert large.size == pytest.approx(still.size * 1000, rel=1e-3)
     moved = solina_bajcsy.fit(points @ quaternions.to_matrix(turn).T + shift).superquadric
     assert metrics.volume_iou(still.transformed(turn, shift), moved) > 0.98
 
@@ -51,13 +43,6 @@ def test_the_lone_axis_becomes_z() -> None:
         start = solina_bajcsy.moment_start(body.sample_surface(2000, rng))
         assert start.parameters[2] == pytest.approx(lone, rel=0.1)
         assert np.linalg.det(start.rotation) == pytest.approx(1.0)
-
-
-def test_the_budget_thins_the_cloud(rng: np.random.Generator) -> None:
-    truth = Superquadric([0.04, 0.03, 0.1], [0.5, 0.7], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-    points = truth.sample_surface(3000, rng)
-    few, many = solina_bajcsy.fit(points[::3]), solina_bajcsy.fit(points)
-    assert metrics.volume_iou(few.superquadric, many.superquadric) > 0.97
 
 
 @pytest.mark.parametrize(
@@ -96,7 +81,6 @@ def noisy_cloud(seed: int) -> np.ndarray:
 
 
 def cost(fit: Fit, points: np.ndarray) -> float:
-    """What the method minimises."""
     found = fit.superquadric
     residual = np.sqrt(np.prod(found.size)) * (found.adjusted_inside_outside(points) - 1)
     return float(residual @ residual)

@@ -1,7 +1,5 @@
 """The surface fit: exact on clean images of both cameras, robust on bad ones, honest about what it cannot know."""
 
-from __future__ import annotations
-
 import re
 import warnings
 from dataclasses import replace
@@ -94,6 +92,7 @@ def test_clean_thesis_images(seed: int) -> None:
     assert fit.status == Status.CONVERGED
     assert fit.residual < 0.6 * GREY
     assert fit.inlier_share > 0.97
+    assert fit.superquadric.canonical_form().to_flat() == pytest.approx(fit.superquadric.to_flat())
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -103,17 +102,6 @@ def test_clean_pinhole_images(seed: int) -> None:
     fit = surface_fit.fit(depth, mask, CAMERA)
     assert iou(fit, truth) > 0.97
     assert fit.noise == pytest.approx(1e-3 / np.sqrt(12), rel=0.5)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_noise_of_two_grey_levels(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = thesis_body(rng)
-    image = thesis_image(truth)
-    noisy = np.clip(np.round(image + rng.normal(0, 2, image.shape)), 1, 255)
-    fit = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8))
-    assert iou(fit, truth) > 0.9
-    assert fit.noise == pytest.approx(2 * GREY, rel=0.15)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -136,8 +124,7 @@ def test_damaged_images(damage: str, seed: int) -> None:
     else:
         depth = np.where(mask, depth, np.float32(1.0))
         mask = cv2.dilate(mask.astype(np.uint8), square) > 0
-    fit = surface_fit.fit(depth, mask, unit_cube.camera())
-    assert iou(fit, truth) > 0.93
+    assert iou(surface_fit.fit(depth, mask, unit_cube.camera()), truth) > 0.93
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -148,8 +135,7 @@ def test_a_nearer_body_hides_a_part(seed: int) -> None:
     columns = np.flatnonzero(mask.any(axis=0))
     hidden = np.arange(CAMERA.width) < columns[int(0.2 * len(columns))]
     depth[:, hidden] = 0.2
-    fit = surface_fit.fit(depth, mask & ~hidden, CAMERA)
-    assert iou(fit, truth) > 0.85
+    assert iou(surface_fit.fit(depth, mask & ~hidden, CAMERA), truth) > 0.85
 
 
 @pytest.mark.parametrize("form", range(8))
@@ -179,13 +165,11 @@ def test_the_best_of_several_starts_wins() -> None:
     depth = unit_cube.depth_from_grey(image)
     fit = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=[nonsense, truth])
     assert iou(fit, truth) > 0.99
-    rescued = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=nonsense)
-    assert iou(rescued, truth) > 0.98
+    assert iou(surface_fit.fit(depth, image > 0, unit_cube.camera(), start=nonsense), truth) > 0.98
 
 
 def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
-    truth = thesis_body(np.random.default_rng(8))
-    image = thesis_image(truth)
+    image = thesis_image(thesis_body(np.random.default_rng(8)))
     upright, turned = fit_grey(image), fit_grey(np.ascontiguousarray(np.rot90(image)))
     assert np.sort(turned.superquadric.size) == pytest.approx(np.sort(upright.superquadric.size), rel=0.01)
     about_view = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])
@@ -197,8 +181,7 @@ def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_mirrored_camera_and_another_unit_change_no_body(seed: int) -> None:
     """Costs are in units of the noise, so that neither metres nor the side of the image count."""
-    truth = pinhole_body(np.random.default_rng(40 + seed))
-    depth, mask = pinhole_image(truth)
+    depth, mask = pinhole_image(pinhole_body(np.random.default_rng(40 + seed)))
     depth = depth + np.random.default_rng(seed).normal(0, 0.002, depth.shape).astype(np.float32)
     options = FitOptions(model_error=0.0, noise=0.002)
     size = np.sort(surface_fit.fit(depth, mask, CAMERA, options=options).superquadric.size)
@@ -255,8 +238,7 @@ def test_bodies_on_a_table_do_not_sink_into_it(seed: int) -> None:
     fit = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane))
     assert iou(fit, truth) > 0.88
     body = fit.superquadric
-    lowest = plane[:3] @ body.translation + plane[3] - body.support(plane[None, :3])[0]
-    assert lowest > -0.003
+    assert (plane[:3] @ body.translation + plane[3] - body.support(plane[None, :3])[0]) > -0.003
     assert np.abs(plane[:3] @ body.rotation_matrix).max() > 0.995
 
 
@@ -279,7 +261,7 @@ def test_a_box_seen_face_on_is_weak_and_says_what_is_missing() -> None:
     assert within >= 4
 
 
-def test_reported_deviations_cover_the_errors() -> None:
+def test_deviations_cover_the_errors_under_noise_of_two_grey_levels() -> None:
     within, total = 0, 0
     for seed in range(12):
         rng = np.random.default_rng(100 + seed)
@@ -287,6 +269,8 @@ def test_reported_deviations_cover_the_errors() -> None:
         image = thesis_image(truth)
         noisy = np.clip(np.round(image + rng.normal(0, 2, image.shape)), 1, 255)
         fit = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8))
+        assert iou(fit, truth) > 0.9
+        assert fit.noise == pytest.approx(2 * GREY, rel=0.15)
         order = np.argsort(fit.superquadric.size)
         error = np.abs(fit.superquadric.size[order] - np.sort(truth.size))
         within += int((error < 2 * fit.sigma_size[order]).sum())
@@ -294,25 +278,6 @@ def test_reported_deviations_cover_the_errors() -> None:
         assert fit.covariance == pytest.approx(fit.covariance.T)
         assert np.linalg.eigvalsh(fit.covariance).min() > 0
     assert within / total > 0.75
-
-
-def test_more_noise_means_less_certainty() -> None:
-    rng = np.random.default_rng(11)
-    truth = thesis_body(rng)
-    image = thesis_image(truth)
-    previous = fit_grey(image).sigma_size.max()
-    for sigma in (2, 6):
-        noisy = np.clip(np.round(image + rng.normal(0, sigma, image.shape)), 1, 255)
-        sure = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8)).sigma_size.max()
-        assert sure > previous
-        previous = sure
-
-
-def test_the_result_is_in_canonical_form() -> None:
-    truth = thesis_body(np.random.default_rng(2))
-    body = fit_grey(thesis_image(truth)).superquadric
-    assert body.canonical_form().to_flat() == pytest.approx(body.to_flat())
-    assert body.size[0] >= body.size[1]
 
 
 def test_a_time_budget_ends_the_search() -> None:
@@ -334,22 +299,6 @@ def square_mask(rows: int, columns: int) -> np.ndarray:
     return mask
 
 
-@pytest.mark.parametrize(
-    ("depth", "mask", "reason"),
-    [
-        (FLAT, square_mask(1, 1), "1 pixels"),
-        (FLAT, square_mask(1, 11), "11 pixels"),
-        (FLAT, square_mask(1, 40), "line"),
-    ],
-)
-def test_too_few_pixels_fail_with_a_reason(depth: np.ndarray, mask: np.ndarray, reason: str) -> None:
-    fit = surface_fit.fit(depth, mask, CAMERA)
-    assert fit.status == Status.FAILED
-    assert reason in fit.message
-    assert np.isfinite(fit.superquadric.to_flat()).all()
-    assert (fit.superquadric.size > 0).all()
-
-
 def test_noise_does_not_pull_bodies_on_a_plane_towards_the_camera() -> None:
     """Points before and behind the surface weigh alike where a superquadric explains the image; 2 mm of noise."""
     shift = []
@@ -361,26 +310,6 @@ def test_noise_does_not_pull_bodies_on_a_plane_towards_the_camera() -> None:
         sight = truth.translation / np.linalg.norm(truth.translation)
         shift.append(sight @ (body.translation - truth.translation))
     assert abs(np.median(shift)) < 0.0003
-
-
-@pytest.mark.parametrize("plane", [None, np.array([0.0, -1.0, 0.0, 0.1])])
-def test_one_depth_everywhere_gives_a_finite_body(plane: np.ndarray | None) -> None:
-    fit = surface_fit.fit(FLAT, square_mask(30, 40), CAMERA, options=FitOptions(plane=plane))
-    assert np.isfinite(fit.superquadric.to_flat()).all()
-    assert fit.status in (Status.WEAK, Status.FAILED, Status.CONVERGED)
-
-
-def test_noise_images_give_a_finite_body(rng: np.random.Generator) -> None:
-    depth = rng.uniform(0.1, 5.0, FLAT.shape).astype(np.float32)
-    depth[rng.random(FLAT.shape) < 0.3] = np.nan
-    fit = surface_fit.fit(depth, rng.random(FLAT.shape) < 0.5, CAMERA)
-    assert np.isfinite(fit.superquadric.to_flat()).all()
-    assert np.isfinite([fit.residual, fit.noise, fit.inlier_share]).all()
-
-
-def test_a_mask_that_fills_the_image() -> None:
-    fit = surface_fit.fit(FLAT, np.ones(FLAT.shape, bool), CAMERA)
-    assert np.isfinite(fit.superquadric.to_flat()).all()
 
 
 @pytest.mark.parametrize(("width", "height"), [(640, 3), (3, 480)])
@@ -410,47 +339,39 @@ def test_a_narrow_mask_is_no_line(width: int) -> None:
 def test_an_inverse_of_information_is_a_covariance(rng: np.random.Generator) -> None:
     """One direction known 10^10 times as well as another that is known from the prior alone."""
     axes, _ = np.linalg.qr(rng.normal(size=(11, 11)))
-    values = np.r_[1e20, 1e12, np.full(9, 1.0)]
-    found = quality._inverse((axes * values) @ axes.T, 1.0)
+    found = quality._inverse((axes * np.r_[1e20, 1e12, np.full(9, 1.0)]) @ axes.T, 1.0)
     deviations = np.linalg.eigvalsh((found + found.T) / 2)
     assert deviations.min() > -1e-12
     assert deviations.max() <= 1 + 1e-9
 
 
 def test_misuse_raises() -> None:
-    mask = square_mask(30, 40)
-    body = Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
-    with pytest.raises(ValueError, match="mask"):
-        surface_fit.fit(FLAT, mask[:100], CAMERA)
-    with pytest.raises(ValueError, match="bool"):
-        surface_fit.fit(FLAT, mask.astype(np.uint8), CAMERA)
-    with pytest.raises(ValueError, match="does not fit a camera"):
-        surface_fit.fit(FLAT[:100], mask[:100], CAMERA)
-    with pytest.raises(ValueError, match="float"):
-        surface_fit.fit(FLAT.astype(np.uint16), mask, CAMERA)
-    for start in ("guess", "", None, 3):
-        with pytest.raises(ValueError, match=f"start: expected .* got {start!r}$"):
-            surface_fit.fit(FLAT, mask, CAMERA, start=start)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="start"):
-        surface_fit.fit(FLAT, mask, CAMERA, start=[body, 3])  # type: ignore[list-item]
-    with pytest.raises(ValueError, match="nothing to fit"):
-        surface_fit.fit(np.full_like(FLAT, np.nan), mask, CAMERA)
-    with pytest.raises(ValueError, match="nothing to fit"):
-        surface_fit.fit(FLAT, np.zeros_like(mask), CAMERA)
-    for wrong in ({"noise": -1.0}, {"plane": np.zeros(4)}, {"pixels": 3}, {"time_budget": 0.0}):
+    mask, body = square_mask(30, 40), Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
+    for depth, pixels, words in (
+        (FLAT, mask[:100], "mask"),
+        (FLAT, mask.astype(np.uint8), "bool"),
+        (FLAT[:100], mask[:100], "does not fit a camera"),
+        (FLAT.astype(np.uint16), mask, "float"),
+        (np.full_like(FLAT, np.nan), mask, "nothing to fit"),
+        (FLAT, np.zeros_like(mask), "nothing to fit"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            surface_fit.fit(depth, pixels, CAMERA)
+    for start, got in *((one, f"{one!r}$") for one in ("guess", "", None, 3)), ([body, 3], ""):
+        with pytest.raises(ValueError, match=f"start: expected .* got {got}"):
+            surface_fit.fit(FLAT, mask, CAMERA, start=start)
+    for wrong in ({"noise": -1.0}, {"noise": np.inf}, {"plane": np.zeros(4)}, {"pixels": 3}, {"time_budget": 0.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
-            FitOptions(**wrong)  # type: ignore[arg-type]
+            FitOptions(**wrong)
 
 
 def test_author_renders(shared_data: Path) -> None:
-    lines = (shared_data / "author_renders" / "labels.txt").read_text().splitlines()[1:]
-    for line in lines:
+    for line in (shared_data / "author_renders" / "labels.txt").read_text().splitlines()[1:]:
         name, *numbers = line.split(",")
         values = np.array([float(x) for x in numbers])
         truth = Superquadric(values[0:3] / 255, values[3:5], values[5:8] / 255, values[17:21])
         image = cv2.imread(str(shared_data / "author_renders" / name), cv2.IMREAD_GRAYSCALE)
-        fit = fit_grey(image)
-        assert iou(fit, unit_cube.optical_from_cube(truth)) > 0.99
+        assert iou(fit_grey(image), unit_cube.optical_from_cube(truth)) > 0.99
 
 
 def test_recorded_box_on_a_table(shared_data: Path) -> None:
@@ -467,16 +388,16 @@ def test_recorded_box_on_a_table(shared_data: Path) -> None:
 
 HARD_SENSOR = {
     "wrong order of the axes, half again as deep": [
-        [0.0572, 0.1074, 0.0585, 0.3235, 0.2392, -0.2553, -0.0206, 1.4608, 0.8913, -0.3293, 0.1179, 0.2886]
+        0.0572, 0.1074, 0.0585, 0.3235, 0.2392, -0.2553, -0.0206, 1.4608, 0.8913, -0.3293, 0.1179, 0.2886
     ],
     "a slab taken for a block": [
-        [0.0375, 0.1122, 0.1108, 0.2937, 0.4964, 0.328, 0.1772, 1.4751, 0.5716, -0.6366, -0.4077, -0.319]
+        0.0375, 0.1122, 0.1108, 0.2937, 0.4964, 0.328, 0.1772, 1.4751, 0.5716, -0.6366, -0.4077, -0.319
     ],
     "a slab far away": [
-        [0.1124, 0.0872, 0.0347, 0.6613, 0.3403, -0.2296, -0.3932, 2.1054, -0.1787, -0.1988, -0.8346, 0.4816]
+        0.1124, 0.0872, 0.0347, 0.6613, 0.3403, -0.2296, -0.3932, 2.1054, -0.1787, -0.1988, -0.8346, 0.4816
     ],
     "a stick with a square end": [
-        [0.0326, 0.0326, 0.0921, 0.3072, 0.5984, -0.3748, 0.0872, 1.8106, 0.0852, 0.7379, 0.4299, 0.5132]
+        0.0326, 0.0326, 0.0921, 0.3072, 0.5984, -0.3748, 0.0872, 1.8106, 0.0852, 0.7379, 0.4299, 0.5132
     ],
 }
 
@@ -487,13 +408,12 @@ def test_hard_bodies_through_a_sensor(name: str) -> None:
     focal = 320 / np.tan(np.deg2rad(30))
     camera = Camera(640, 480, focal, focal, 319.5, 239.5)
     rng = np.random.default_rng(5)
-    for flat in HARD_SENSOR[name]:
-        body = Superquadric.from_flat(np.array(flat))
-        depth, index = raycast.render(body, camera)
-        mask = index >= 0
-        depth = np.where(mask, depth, np.nan)
-        noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
-        assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.85
+    body = Superquadric.from_flat(np.array(HARD_SENSOR[name]))
+    depth, index = raycast.render(body, camera)
+    mask = index >= 0
+    depth = np.where(mask, depth, np.nan)
+    noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
+    assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.85
 
 
 @pytest.mark.parametrize("seed", [6, 11])
@@ -585,7 +505,7 @@ def test_an_object_of_a_camera_has_the_deviations_of_things(monkeypatch: pytest.
     depth, mask = pinhole_image(body)
     depth = depth + np.random.default_rng(3).normal(0, 0.001, depth.shape).astype(np.float32)
     sigmas = []
-    for factor in (surface_fit.course.SPREAD, 1.0):
-        monkeypatch.setattr(surface_fit.course, "SPREAD", factor)
+    for factor in (surface_fit.SPREAD, 1.0):
+        monkeypatch.setattr(surface_fit, "SPREAD", factor)
         sigmas.append(surface_fit.fit(depth, mask, CAMERA).sigma_size)
     assert (sigmas[0] > 2 * sigmas[1]).all()

@@ -77,14 +77,12 @@ def test_a_folder_that_others_can_write_is_not_read(installation: Path, tmp_path
     uid = 0  # unshare -r
     (tmp_path / f"sq_perception-kernels-{uid}").mkdir()
     (tmp_path / f"sq_perception-kernels-{uid}").chmod(0o777)
-    done = run(installation, tmp_path)
-    assert "expected a folder of this user alone" in done.stderr
+    assert "expected a folder of this user alone" in run(installation, tmp_path).stderr
     assert not list((tmp_path / f"sq_perception-kernels-{uid}").iterdir())
 
 
 def test_a_named_place_goes_first(installation: Path, tmp_path: Path) -> None:
-    done = run(installation, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "named"))
-    assert "kept in" not in done.stderr
+    assert "kept in" not in run(installation, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "named")).stderr
     assert [path.name for path in tmp_path.iterdir()] == ["named"]
 
 

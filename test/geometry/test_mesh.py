@@ -65,8 +65,7 @@ def test_export_writes_scenes_that_read_back(tmp_path):
     scene = trimesh.load_scene(export(Superquadric.stack(bodies), tmp_path / "bodies.glb"))
     assert sorted(scene.graph.nodes_geometry) == ["body_0", "body_1"]
     upright = scene.to_mesh().bounds.mean(axis=0)
-    expected = merged.bounds.mean(axis=0) * [1, -1, -1]
-    np.testing.assert_allclose(upright, expected, atol=1e-5)
+    np.testing.assert_allclose(upright, merged.bounds.mean(axis=0) * [1, -1, -1], atol=1e-5)
     for suffix in ("stl", "obj"):
         scene = trimesh.load_scene(export(bodies, tmp_path / f"bodies.{suffix}"))
         np.testing.assert_allclose(scene.bounds, merged.bounds, atol=1e-5)
@@ -112,8 +111,7 @@ def test_any_two_colours_differ_to_every_eye():
         share = np.clip(linear @ np.transpose(eye), 0, 1) @ to_xyz.T / to_xyz.sum(axis=1)
         x, y, z = np.where(share > (6 / 29) ** 3, np.cbrt(share), share / (3 * (6 / 29) ** 2) + 4 / 29).T
         lab = np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
-        different = np.linalg.norm(lab[:, None] - lab, axis=-1) + 100 * np.eye(len(lab))
-        assert different.min() > 25, eye
+        assert (np.linalg.norm(lab[:, None] - lab, axis=-1) + 100 * np.eye(len(lab))).min() > 25, eye
 
 
 def test_markers_have_the_colours_of_meshes():

@@ -19,14 +19,11 @@ def test_column_counting_is_the_thesis_grid() -> None:
     np.testing.assert_allclose(metrics.thesis_iou(a, b, 24), expected, atol=1e-9)
 
 
-def test_shifted_box_in_closed_form() -> None:
+def test_shifted_and_nested_bodies_have_their_closed_forms() -> None:
     a = Superquadric(np.array([0.1, 0.2, 0.3]), np.full(2, 0.01), np.zeros(3), IDENTITY)
     b = a.transformed(IDENTITY, np.array([0.0, 0.1, 0.0]))
     assert (metrics.volume_iou(a, b, 200), metrics.volume_iou(a, a, 100)) == (pytest.approx(0.3 / 0.5, abs=0.01), 1)
     assert metrics.volume_iou(a, a.transformed(IDENTITY, np.array([5.0, 0, 0]))) == 0
-
-
-def test_nested_bodies_give_the_volume_ratio() -> None:
     bodies = thesis_bodies(10, np.random.default_rng(2))
     inner = Superquadric(bodies.size * 0.8, bodies.shape, bodies.translation, bodies.rotation)
     np.testing.assert_allclose(metrics.volume_iou(inner, bodies, 128), 0.8**3, atol=0.01)

@@ -46,9 +46,7 @@ FORMS = [(shape, taper) for taper in (STRAIGHT, TAPERED) for shape in ((0.1, 0.1
 
 
 @pytest.mark.parametrize(("shape", "taper"), [*FORMS, ((1.5, 1.8), STRAIGHT), ((1.5, 1.8), (0.3, 0.3))])
-def test_it_never_exceeds_the_distance_and_comes_near_it(
-    shape: tuple[float, float], taper: tuple[float, float]
-) -> None:
+def test_it_never_exceeds_the_distance_and_comes_near_it(shape, taper) -> None:
     """Outside, no point of the surface is nearer; the samples of it are farther than the nearest."""
     body = placed([1.0, 0.6, 0.3], list(shape), taper)
     surface = body.sample_surface(4000, np.random.default_rng(3))
@@ -70,12 +68,14 @@ def test_inside_it_is_no_shallower_than_the_depth() -> None:
     assert (-body.signed_distance(points) >= depth - 0.02).all()
 
 
-def test_a_surface_point_has_distance_zero_and_its_normal() -> None:
+def test_a_surface_point_has_distance_zero_and_its_normal_and_the_centre_a_finite_one() -> None:
     body = placed([1.0, 0.6, 0.3], [0.5, 0.8])
     surface = body.sample_surface(500, np.random.default_rng(6))
     distance, gradient = body.signed_distance(surface, gradient=True)
     assert np.allclose(distance, 0, atol=1e-9)
     assert np.einsum("ij,ij->i", gradient, body.normals(surface)).min() > 0.999
+    body = placed([1.0, 0.6, 0.3], [0.5, 0.8], (0.3, 0.3))
+    assert body.signed_distance(body.translation[None])[0] == pytest.approx(-0.3, abs=0.02)
 
 
 def test_the_gradient_says_how_the_distance_grows() -> None:
@@ -87,11 +87,6 @@ def test_the_gradient_says_how_the_distance_grows() -> None:
     assert np.allclose(np.linalg.norm(gradient, axis=1), 1)
     for step in (-0.01, 0.01):
         assert np.allclose(body.signed_distance(points + step * gradient) - distance, step, rtol=0.05)
-
-
-def test_the_centre_has_a_finite_one() -> None:
-    body = placed([1.0, 0.6, 0.3], [0.5, 0.8], (0.3, 0.3))
-    assert body.signed_distance(body.translation[None])[0] == pytest.approx(-0.3, abs=0.02)
 
 
 def test_a_union_is_its_nearest_body() -> None:

@@ -35,8 +35,7 @@ def test_a_vessel_is_taken_by_its_rim():
         np.testing.assert_allclose(axes[:, 2], [0, 0, 1], atol=1e-9)
         assert axes[:2, 1] @ out == pytest.approx(1.0, abs=1e-2)
         assert np.linalg.norm(grasp.position[:2]) == pytest.approx(RADIUS - 0.5 * WALL, abs=3e-3)
-        tips = grasp.position[2] + PANDA.tip
-        assert RIM + 0.01 < tips < 0.595
+        assert RIM + 0.01 < (grasp.position[2] + PANDA.tip) < 0.595
         assert grasp.opening > grasp.width + 0.01
         assert 0.5 < grasp.score < 0.95
 

@@ -22,7 +22,6 @@ _OPTIONS = (
 
 
 def executable() -> str | None:
-    """The path of a Chromium, None where there is none."""
     return next((path for name in NAMES if (path := shutil.which(name))), None)
 
 

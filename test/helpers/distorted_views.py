@@ -36,14 +36,12 @@ def share_seen(undone: Rectification) -> float:
 
 
 def plane_depth(directions: np.ndarray, normal: np.ndarray, distance: float) -> np.ndarray:
-    """Depth of the plane normal . p = distance."""
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = distance / (directions @ normal)
         return np.where((depth > 0.05) & (depth < 20), depth, np.nan)
 
 
 def sphere_depth(directions: np.ndarray, centre: np.ndarray, radius: float) -> np.ndarray:
-    """Depth of the near side of a sphere."""
     along, square = directions @ centre, (directions * directions).sum(axis=-1)
     with np.errstate(invalid="ignore"):
         return (along - np.sqrt(along * along - square * (centre @ centre - radius * radius))) / square

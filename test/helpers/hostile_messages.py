@@ -50,8 +50,6 @@ class HostileFrame:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a node answered to one frame."""
-
     answered: bool
     message: str
 
@@ -196,7 +194,6 @@ def hostile_infos(draw: st.DrawFn, width: int, height: int, header: Header) -> C
 
 
 def sound_info(image: Image) -> CameraInfo:
-    """What a camera would say about an image."""
     width, height = max(int(image.width), 1), max(int(image.height), 1)
     known = Intrinsics(width, height, 60.0, 60.0, (width - 1) / 2, (height - 1) / 2)
     return intrinsics_to_message(known, image.header)

@@ -54,8 +54,7 @@ def outline(
     body: Superquadric, origin: torch.Tensor, direction: torch.Tensor, free_depth: torch.Tensor
 ) -> torch.Tensor:
     """(1 - min g) / |grad g| along rays up to a depth, metres: positive where a ray runs inside the body."""
-    lowest = torch.minimum(_lowest(body, origin, direction), free_depth)
-    point = origin + lowest[:, None] * direction
+    point = origin + torch.minimum(_lowest(body, origin, direction), free_depth)[:, None] * direction
     return (1 - body.gauge(point)) / _slope(body, point).detach().norm(dim=-1)
 
 

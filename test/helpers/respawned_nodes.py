@@ -94,7 +94,6 @@ class Robot:
                 self.running[member].kill()
 
     def start(self, member: str) -> None:
-        """Start one of the three."""
         if member == VIEWER:
             self.running[member] = Viewer(f"/{self._node}/superquadrics")
         elif member == CAMERA:
@@ -152,7 +151,6 @@ class Robot:
         return result
 
     def _silence(self, member: str, began: float, ended: float) -> float:
-        """The longest gap in what does not need the killed process."""
         heard = {
             CAMERA: [one.time for one in self.diagnoses],
             NODE: self.infos,
@@ -162,5 +160,4 @@ class Robot:
         return max(later - earlier for earlier, later in pairwise(times))
 
     def left(self) -> list[int]:
-        """Processes that were ever started and still exist."""
         return [pid for pid in self.pids if Path(f"/proc/{pid}").exists()]

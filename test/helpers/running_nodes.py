@@ -8,7 +8,6 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -71,7 +70,6 @@ class Answer:
 
     @property
     def stamp(self) -> int:
-        """Nanoseconds."""
         return stamp_of(self.message)
 
 
@@ -85,7 +83,6 @@ class Diagnosis:
     values: dict[str, str] = field(default_factory=dict)
 
     def count(self, key: str) -> int:
-        """A counter of frames."""
         return int(self.values[key])
 
     @property
@@ -97,8 +94,6 @@ class Diagnosis:
 
 @dataclass(frozen=True)
 class Call:
-    """One answer of a service and the milliseconds that it took."""
-
     response: Any
     milliseconds: float
 
@@ -137,7 +132,6 @@ class Peer(SpunNodes):
         return self._answers[node]
 
     def diagnoses(self, node: str) -> list[Diagnosis]:
-        """The reports about a node's frames, growing."""
         return self._diagnoses.setdefault(node, [])
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -151,22 +145,18 @@ class Peer(SpunNodes):
     # Speaking
 
     def publisher(self, kind: type[Any], topic: str, depth: int = 5) -> Any:
-        """The publisher of a topic, made at the first call."""
         full = _absolute(topic)
         if full not in self._publishers:
             self._publishers[full] = self.node.create_publisher(kind, full, depth)
         return self._publishers[full]
 
     def silence(self, topic: str) -> None:
-        """Destroy the publisher of a topic."""
         self.node.destroy_publisher(self._publishers.pop(_absolute(topic)))
 
     def header(self, frame_id: str = "a_camera") -> Header:
-        """A header of now."""
         return Header(stamp=self.node.get_clock().now().to_msg(), frame_id=frame_id)
 
     def start_call(self, kind: type[Any], name: str, request: Any, alive: Sequence[Child] = ()) -> Future:
-        """Call a service; the future holds the response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
             self.executor.wake()
@@ -174,7 +164,6 @@ class Peer(SpunNodes):
         return self._clients[name].call_async(request)
 
     def call(self, kind: type[Any], name: str, request: Any, alive: Sequence[Child] = ()) -> Call:
-        """Call a service and wait for its answer."""
         done: list[float] = []
         began = time.perf_counter()
         future = self.start_call(kind, name, request, alive)
@@ -189,7 +178,6 @@ class Peer(SpunNodes):
         return list(self.call(SetParameters, f"{node}/set_parameters", request, alive).response.results)
 
     def get(self, node: str, *names: str, alive: Sequence[Child] = ()) -> list[Any]:
-        """Values of parameters."""
         request = GetParameters.Request(names=list(names))
         found = self.call(GetParameters, f"{node}/get_parameters", request, alive).response.values
         return [parameter_value_to_python(one) for one in found]
@@ -199,7 +187,6 @@ class Peer(SpunNodes):
     def frame(
         self, bodies: Superquadric = BODIES, camera: Camera = CAMERA, frame_id: str = "a_camera"
     ) -> tuple[Image, CameraInfo]:
-        """The image of bodies with a stamp of now, and its camera_info."""
         header = self.header(frame_id)
         return depth_to_message(_rendered(bodies, camera), header), intrinsics_to_message(intrinsics(camera), header)
 
@@ -237,35 +224,8 @@ def _rendered(bodies: Superquadric, camera: Camera) -> np.ndarray:
 
 
 def _owner(status: DiagnosticStatus) -> str:
-    """The full name of the node that a status is about."""
     return "/" + status.name.split(":")[0].strip().lstrip("/")
 
 
 def _absolute(topic: str) -> str:
     return "/" + topic.lstrip("/")
-
-
-# Processes
-
-
-@dataclass(frozen=True)
-class Usage:
-    """What a process holds: resident memory, MB, and counts; segments are the files of Fast DDS that it maps."""
-
-    rss: float
-    threads: int
-    files: int
-    segments: int
-
-
-def usage(pid: int) -> Usage:
-    """Read from /proc; OSError if there is no such process."""
-    place = Path("/proc") / str(pid)
-    lines = (line.split(":", 1) for line in (place / "status").read_text().splitlines())
-    status = {key: value.split() for key, value in lines}
-    maps = (place / "maps").read_text().splitlines()
-    mapped = {line.rsplit("/", 1)[1] for line in maps if "/fastrtps_" in line}
-    return Usage(
-        rss=int(status["VmRSS"][0]) / 1024, threads=int(status["Threads"][0]), files=len(os.listdir(place / "fd")),
-        segments=len(mapped),
-    )

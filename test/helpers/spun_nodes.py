@@ -26,7 +26,6 @@ class SpunNodes:
         self.peer = Node("peer", context=self.context)
 
     def spin(self, nodes: Sequence[Node], executor: Any = None) -> None:
-        """Spin the nodes and the peer by an executor of that class."""
         self._all = (*nodes, self.peer)
         self.executor = (executor or SingleThreadedExecutor)(context=self.context)
         for node in self._all:
@@ -74,13 +73,11 @@ class SpunNodes:
             time.sleep(0.005)
 
     def hear(self, kind: Any, topic: str, quality: Any = 5) -> list[Any]:
-        """The messages of a topic, growing."""
         messages: list[Any] = []
         self.peer.create_subscription(kind, topic, messages.append, quality)
         return messages
 
     def ask(self, kind: Any, name: str, request: Any = None) -> Future:
-        """Call a service; the answer is still to come."""
         client = self.peer.create_client(kind, name)
         self.until(client.service_is_ready)
         return client.call_async(request or kind.Request())

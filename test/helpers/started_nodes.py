@@ -43,22 +43,18 @@ class Child(subprocess.Popen[bytes]):
 
     @property
     def exit_code(self) -> int | None:
-        """None while it runs."""
         return self.poll()
 
     def output(self) -> str:
-        """All that it has said on standard output and error."""
         return os.pread(self._output.fileno(), 2**24, 0).decode(errors="replace")
 
     def last_lines(self) -> list[str]:
         return self.output().splitlines()[-15:]
 
     def interrupt(self) -> None:
-        """Interrupt it and all that it started, as Ctrl-C does."""
         self.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
-        """End it and all that it started."""
         self.send_signal(signal.SIGKILL)
         self.wait()
 
@@ -69,13 +65,10 @@ class Child(subprocess.Popen[bytes]):
                 os.killpg(self.pid, sig)
 
     def close(self) -> None:
-        """Forget what it said; for one that has ended."""
         self._output.close()
 
 
 class Children:
-    """Nodes that live as long as a ``with`` block."""
-
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         self._environment = environment
         self._running: list[Child] = []
@@ -96,7 +89,6 @@ class Children:
             child.close()
 
     def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
-        """Start one node."""
         child = Child(node, arguments, self._environment)
         self._running.append(child)
         return child

@@ -63,7 +63,6 @@ def best_iou(mask, labels):
 
 
 def ious(truth, labels):
-    """Of each body, likewise."""
     return [best_iou(truth == k, labels) for k in range(1, truth.max() + 1)]
 
 

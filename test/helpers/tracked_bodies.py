@@ -17,7 +17,6 @@ NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
 
 
 def image_of(bodies, behind=1.5):
-    """The depth image of some bodies before a wall."""
     depth, _ = render(bodies if isinstance(bodies, Superquadric) else Superquadric.stack(bodies), CAMERA)
     return np.where(np.isfinite(depth), depth, behind)
 
@@ -99,10 +98,8 @@ def from_camera(seen, rotation, position):
 
 
 def looking_at(target, direction, distance):
-    """Pose of a camera that looks at a point from a direction."""
     forward = -direction / np.linalg.norm(direction)
-    helper = np.array([0, 1.0, 0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0, 0])
-    right = np.cross(helper, forward)
+    right = np.cross(np.array([0, 1.0, 0]) if abs(forward[1]) < 0.9 else np.array([1.0, 0, 0]), forward)
     right /= np.linalg.norm(right)
     matrix = np.stack([right, np.cross(forward, right), forward], axis=1)
     return quaternions.from_matrix(matrix), target - distance * forward

@@ -92,24 +92,6 @@ def test_what_the_lens_cannot_show_is_nan():
     assert np.isnan(lens.inverse(np.array([[np.nan, 0], [np.inf, 0]]))).all()
 
 
-@pytest.mark.parametrize(
-    ("model", "coefficients", "words"),
-    [
-        ("unified", (1, 2, 3, 4), "plumb_bob, rational_polynomial, equidistant, got 'unified'"),
-        ("plumb_bob", (1, 2, 3), "4 or 5 or 8 or 12 or 14 coefficients, got 3"),
-        ("equidistant", (0,) * 5, "expected 4 coefficients, got 5"),
-        ("plumb_bob", (np.nan, 0, 0, 0), "finite"),
-        ("plumb_bob", (np.inf, 0, 0, 0), "finite"),
-        ("plumb_bob", (1e9, 0, 0, 0), "up to 1e"),
-        ("rational_polynomial", (0,) * 11 + (0.1,), "thin prism and tilt"),
-        ("rational_polynomial", (0,) * 13 + (0.1,), "thin prism and tilt"),
-    ],
-)
-def test_misuse_is_named(model, coefficients, words):
-    with pytest.raises(ValueError, match=words):
-        Distortion(model, coefficients)
-
-
 @pytest.mark.filterwarnings("error")
 def test_absurd_lenses_have_answers(rng):
     """Whatever the coefficients, an image has the place that its ray's equation gives, or none."""

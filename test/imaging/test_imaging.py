@@ -181,8 +181,7 @@ class TestUnitCube:
 
 class TestCanonicalView:
     def test_inverse_is_exact(self) -> None:
-        bodies = tabletop_bodies(30, 5)
-        for body in bodies:
+        for body in tabletop_bodies(30, 5):
             depth, index = raycast.render(body, VGA)
             if (index >= 0).sum() < 50:
                 continue
@@ -226,8 +225,7 @@ class TestCanonicalView:
             same = view.to_canonical(unit_cube.optical_from_cube(body))
             np.testing.assert_allclose(same.to_flat()[:8], canonical[k].to_flat()[:8], atol=0.03)
             assert ((view.image > 0) != (images[k] > 0)).mean() < 0.05
-            both = (view.image > 0) & (images[k] > 0)
-            assert np.abs(view.image - images[k])[both].mean() < 0.03
+            assert np.abs(view.image - images[k])[(view.image > 0) & (images[k] > 0)].mean() < 0.03
 
     def test_direct_rendering_is_the_view_of_a_pinhole_image(self) -> None:
         """What a near camera cannot see is missing from both, although the direct way casts parallel rays."""
@@ -268,16 +266,14 @@ class TestCanonicalView:
         bodies = same.to_canonical(rolled[0]), view.to_canonical(body)
         np.testing.assert_allclose(*(each.to_flat()[:8] for each in bodies), atol=0.02)
         assert (view.hidden != same.hidden).mean() < 0.04
-        both = (view.image > 0) & (same.image > 0)
-        assert np.abs(view.image - same.image)[both].mean() < 0.01
+        assert np.abs(view.image - same.image)[(view.image > 0) & (same.image > 0)].mean() < 0.01
 
     @pytest.mark.parametrize("normal", [(0.06, 0.04, -0.997), (0.1, -0.7, -0.707)], ids=["from above", "hardly rolled"])
     def test_where_there_is_no_roll_to_undo_the_view_is_that_of_the_camera(self, normal: tuple[float, ...]) -> None:
         body = Superquadric([0.05, 0.08, 0.12], [0.3, 0.7], [0.0, 0.0, 0.9], [0.5, 0.2, -0.1, 0.8])
         depth, index = raycast.render(body, VGA)
         view = canonical_view.from_mask(depth, index >= 0, VGA, plane=np.array([*normal, 1.2]))
-        plain = canonical_view.from_mask(depth, index >= 0, VGA)
-        np.testing.assert_array_equal(view.image, plain.image)
+        np.testing.assert_array_equal(view.image, canonical_view.from_mask(depth, index >= 0, VGA).image)
 
     def test_what_is_beside_the_object_is_shown_by_how_much_nearer_it_is(self) -> None:
         """A card of 40 pixels square, so that one is 1 / (40 MARGIN) of the view; what is beside it in four strips."""
@@ -339,8 +335,7 @@ class TestSoftRender:
         soft = soft_images(tensors, axis, soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU).numpy()
         for body, image in zip(bodies, soft, strict=True):
             depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(64))
-            exact = np.where(np.isfinite(depth), 1 - depth, 0)
-            assert np.abs(image - exact).mean() < 0.0056
+            assert np.abs(image - np.where(np.isfinite(depth), 1 - depth, 0)).mean() < 0.0056
 
     @pytest.mark.parametrize(("s", "tau"), [(soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU), (8.0, 0.5)])
     def test_the_compiled_agreement_is_that_of_the_soft_image(self, s: float, tau: float) -> None:

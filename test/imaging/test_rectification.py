@@ -118,8 +118,7 @@ def test_labels_go_with_their_pixels(rng):
     for label, there in ((found > 0, depth == 0.5), (found < 0, depth == 1.0)):
         assert label[there].all()
         assert there[label].mean() > 0.97
-    again = undone.back.labels(found)
-    assert (again == labels).mean() > 0.998
+    assert (undone.back.labels(found) == labels).mean() > 0.998
     np.testing.assert_array_equal(undone.there.labels(labels > 0), found > 0)
 
 

@@ -160,14 +160,11 @@ def test_they_are_a_partition(count: int) -> None:
     assert sizes.min() > 0.5 * np.count_nonzero(cells) / count
 
 
-def test_four_of_a_square_are_its_quarters() -> None:
+def test_four_pieces_of_a_square_are_its_quarters_and_there_are_no_more_than_cells() -> None:
     found = compact_pieces(square(24), 4, (0.0, 0.0))
     assert np.bincount(found[found >= 0]).tolist() == [144] * 4
     for number in range(4):
         rows, columns = np.nonzero(found == number)
         assert np.ptp(rows) == np.ptp(columns) == 11
-
-
-def test_no_more_pieces_than_cells() -> None:
     cells = square(1)
     assert compact_pieces(cells, 4, (20.0, 20.0))[cells].tolist() == [0]

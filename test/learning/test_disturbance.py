@@ -78,8 +78,7 @@ class TestHiddenPixels:
         whole = canonical_view.from_mask(np.where(alone, depth, 2.0), alone & (index >= 0), VGA)
         assert not whole.hidden.any()
         # Free pixels lie beyond both bodies; the view's own pixels tell where they are.
-        points = view_points(view)
-        uv = np.rint(VGA.project(points)).astype(int)
+        uv = np.rint(VGA.project(view_points(view))).astype(int)
         inside = (uv >= 0).all(axis=-1) & (uv < [VGA.width, VGA.height]).all(axis=-1)
         what = np.full(view.image.shape, -1)
         what[inside] = index[uv[inside][:, 1], uv[inside][:, 0]]

@@ -12,7 +12,7 @@ from safetensors.numpy import load_file, save_file
 
 from sq_perception.commands import main
 from sq_perception.files import output_file
-from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
+from sq_perception.imaging.segment_view import CHANNELS, MEASURED, OTHERS, PIXELS, SEGMENT
 from sq_perception.learning import checkpoint, shard_training
 from sq_perception.learning.network_config import MaskConfig
 from sq_perception.learning.networks import MaskNetwork
@@ -44,6 +44,25 @@ def test_the_loss_is_a_weighted_cross_entropy() -> None:
     assert float(shard_training.mask_loss(logits, (images,), torch.full_like(truth, UNKNOWN))) == 0
 
 
+def test_a_hidden_label_takes_readings_and_tells_nothing_about_them(rng: np.random.Generator) -> None:
+    """A square segment of one object; what is beyond a band may become another segment, and is the object's still."""
+    shown, parted = set(range(CHANNELS)) - set(shard_training.HIDDEN), 0
+    for _ in range(60):
+        image, truth = np.ones((PIXELS, PIXELS, CHANNELS), np.float32), np.full((PIXELS, PIXELS), NO, np.uint8)
+        image[..., [SEGMENT, OTHERS]] = 0
+        image[20:44, 20:44, SEGMENT], truth[20:44, 20:44] = 1, YES
+        shard_training.hide_label(image, truth, rng)
+        gone = image[..., MEASURED] == 0
+        assert 0 < np.count_nonzero(gone) < 24 * 24
+        assert (image[gone][:, shard_training.HIDDEN] == 0).all()
+        assert (truth == np.where(gone, UNKNOWN, np.where(truth == NO, NO, YES))).all()
+        assert (image[..., sorted(shown)] == 1).all()
+        both = image[..., SEGMENT] + image[..., OTHERS]
+        assert (both[20:44, 20:44] == ~gone[20:44, 20:44]).all()
+        parted += image[..., OTHERS].any()
+    assert 5 < parted < 40
+
+
 def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
     kind = replace(shard_training.MASKS, network=lambda _: MaskNetwork(SMALL))
@@ -52,13 +71,10 @@ def test_a_training_learns_and_is_read_again(tmp_path: Path, rng: np.random.Gene
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert records[-1]["outliers"] == pytest.approx(1, abs=0.1)
     assert records[-1]["left"] < records[-1]["outliers"]
-    again = checkpoint.load_masks(tmp_path / "run" / "masks.safetensors")
-    assert again.config == SMALL == network.config
+    assert checkpoint.load_masks(tmp_path / "run" / "masks.safetensors").config == SMALL == network.config
 
 
-def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
-    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(tmp_path, rng, monkeypatch) -> None:
     """Two of five, or one that is larger than all that may be held; others after each validation."""
     shards(tmp_path / "views", 6, rng)
     size, read = (tmp_path / "views" / "00000.safetensors").stat().st_size, []
@@ -84,9 +100,7 @@ def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
         assert {shard for pool in pools for shard in pool} == {f"{k:05d}" for k in range(1, 6)}
 
 
-def test_too_few_views_are_refused_and_a_shard_that_is_being_written_is_not_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator
-) -> None:
+def test_too_few_views_are_refused_and_a_shard_that_is_being_written_is_not_read(tmp_path, capsys, rng) -> None:
     tmp_path.joinpath("empty").mkdir()
     shards(tmp_path / "views", 2, rng)
     with output_file.writing(tmp_path / "views" / "00002.safetensors"):
@@ -116,9 +130,7 @@ def test_a_damaged_shard_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
         ("truth", np.zeros((), np.uint8)),
     ],
 )
-def test_a_shard_of_another_form_is_named(
-    tmp_path: Path, rng: np.random.Generator, name: str, wrong: np.ndarray
-) -> None:
+def test_a_shard_of_another_form_is_named(tmp_path, rng, name, wrong) -> None:
     shards(tmp_path / "views", 3, rng)
     path = tmp_path / "views" / "00001.safetensors"
     save_file({**load_file(str(path)), name: wrong}, str(path))
@@ -127,9 +139,7 @@ def test_a_shard_of_another_form_is_named(
 
 
 @pytest.mark.parametrize("filled", [False, True])
-def test_shards_without_a_view_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator, filled: bool
-) -> None:
+def test_shards_without_a_view_are_named(tmp_path, capsys, rng, filled) -> None:
     """All of them, or those that are kept for validation."""
     shards(tmp_path / "views", 3, rng)
     for k in range(2 if filled else 3):

@@ -145,9 +145,7 @@ class TestShippedWeights:
             ("robust", ViewSource(), 0.3, 0.85, 0.6),
         ],
     )
-    def test_they_read_unseen_bodies(
-        self, name: str, source: ViewSource, hidden: float, least: float, over_85: float
-    ) -> None:
+    def test_they_read_unseen_bodies(self, name, source, hidden, least, over_85) -> None:
         """Networks alone, on bodies of seeds that no training uses."""
         rng = np.random.default_rng(123456)
         views, truth = draw_views(300, rng, source, any_occluder(np.full(300, hidden), rng) if hidden else None)
@@ -164,14 +162,19 @@ class TestShippedWeights:
             checkpoint.load("unheard-of")
 
     def test_they_say_where_they_come_from(self) -> None:
-        for path in (checkpoint.resolve(name) for name in ("robust", "supervised")):
-            header = checkpoint.read_header(path)
+        for name in ("robust", "supervised", "things"):
+            header = checkpoint.read_header(name)
             made, training = json.loads(header["made"]), json.loads(header["training"])
-            assert made["hours"] > 0
-            assert made["commit"]
-            assert training["seed"]
-            assert json.loads(header["metrics"])["iou"] > 0.9
-            assert path.stat().st_size < 8_000_000
+            figures = json.loads(header.get("metrics") or header["validation"])
+            if name == "things":
+                assert "train-things" in made["command"]
+                assert min(training["views"], figures["error"]) > 0
+            else:
+                assert made["hours"] > 0
+                assert made["commit"]
+                assert training["seed"]
+                assert figures["iou"] > 0.9
+            assert checkpoint.resolve(name).stat().st_size < 8_000_000
 
 
 class TestPrecision:
@@ -207,8 +210,7 @@ class TestCheckpoint:
 
     def test_files_from_before_there_were_backbones(self, tmp_path: Path) -> None:
         path = tmp_path / "m.safetensors"
-        model = Regressor(COMPACT)
-        checkpoint.save(path, model, dtype=np.float32)
+        checkpoint.save(path, Regressor(COMPACT), dtype=np.float32)
         header, state = checkpoint.read_header(path), load_file(str(path))
         config = json.loads(header["config"])
         for name in ("backbone", "framing"):
@@ -229,9 +231,7 @@ class TestCheckpoint:
         ],
         ids=lambda change: " ".join(change) + " " + str(next(iter(change.values())))[:12],
     )
-    def test_hostile_headers_are_refused_before_they_cost_memory(
-        self, config: RegressorConfig, change: dict[str, Any], tmp_path: Path
-    ) -> None:
+    def test_hostile_headers_are_refused_before_they_cost_memory(self, config, change, tmp_path) -> None:
         """Any of these networks in full would take gigabytes, or never end."""
         header = {"format": checkpoint.FORMAT, "version": checkpoint.VERSION}
         header["config"] = json.dumps({**asdict(config), **change})

@@ -39,7 +39,7 @@ def shards(folder: Path, count: int, rng: np.random.Generator) -> None:
         save_file(arrays, str(folder / f"{k:05d}.safetensors"))
 
 
-def test_directions_are_42_and_closed_under_mirrors() -> None:
+def test_directions_are_42_and_closed_under_mirrors_and_planes_mirror_with_their_points(rng) -> None:
     assert DIRECTIONS.shape == (42, 3)
     assert np.linalg.norm(DIRECTIONS, axis=1) == pytest.approx(np.ones(42))
     for axis in range(3):
@@ -47,6 +47,10 @@ def test_directions_are_42_and_closed_under_mirrors() -> None:
         assert DIRECTIONS[mirrored(axis)] == pytest.approx(turned)
     # No two of them are nearer than the edge of a twice divided icosahedron allows.
     assert np.max(DIRECTIONS @ DIRECTIONS.T - 2 * np.eye(42)) == pytest.approx(0.8506508, abs=1e-6)
+    plane, points = rng.standard_normal(4), rng.random((10, 3))
+    there = mirror_planes(plane[None])[0]
+    moved = points * [-1, 1, 1] + [1, 0, 0]
+    assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
 
 
 def test_the_likelihood_is_that_of_a_multivariate_t(rng: np.random.Generator) -> None:
@@ -92,13 +96,6 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
     assert (np.linalg.eigvalsh(straight.covariance) > 0).all()
 
 
-def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
-    plane, points = rng.standard_normal(4), rng.random((10, 3))
-    there = mirror_planes(plane[None])[0]
-    moved = points * [-1, 1, 1] + [1, 0, 0]
-    assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
-
-
 def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> None:
     path, given = tmp_path / "things.safetensors", ThingNetwork(replace(SMALL, spread=0.4))
     checkpoint.save(path, given)
@@ -109,9 +106,7 @@ def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> No
         assert torch.allclose(weights.float(), network.state_dict()[name].float(), rtol=1e-3, atol=1e-4), name
 
 
-def test_it_begins_with_no_network_of_another_kind_and_no_other_goes_on_with_its_state(
-    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_begins_with_no_network_of_another_kind_and_no_other_goes_on_with_its_state(tmp_path, rng, capsys) -> None:
     shards(tmp_path / "views", 3, rng)
     run = ["train-things", str(tmp_path / "views"), "--output", str(tmp_path / "run"), "--batch", "2"]
     for start, kind in (("masks", "masks"), ("robust", "regressor")):
@@ -193,20 +188,10 @@ def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.parametrize(("processed", "least", "most"), [(0.0, 0.8, 1.25), (1.0, 0.9, 1.5)])
-def test_the_shipped_network_says_how_well_it_knows(
-    processed: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_shipped_network_says_how_well_it_knows(processed, least, most, monkeypatch) -> None:
     """On views that no training saw: the error of the support function, and its deviation in units of the said one."""
     monkeypatch.setattr(thing_views, "PROCESSED", processed)
     held = draw_thing_views(240, np.random.default_rng([77, 1]))
     found = shard_training.validate_things(checkpoint.load_things(), held)
     assert found["error"] < 0.09
     assert least < found["ratio"] < most
-
-
-def test_the_shipped_network_says_where_it_comes_from() -> None:
-    header = checkpoint.read_header("things")
-    assert "train-things" in json.loads(header["made"])["command"]
-    assert json.loads(header["training"])["views"] > 0
-    assert json.loads(header.get("metrics") or header["validation"])["error"] > 0
-    assert checkpoint.resolve("things").stat().st_size < 8_000_000

@@ -37,12 +37,10 @@ WRONG_SHARES = {"occluded": 1.5, "noisy": -0.1, "pinhole": 2.0, "wide": -1.0}
 
 
 def log_of(folder: Path) -> list[dict[str, Any]]:
-    """The records of a run."""
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
 def endless(folder: Path, validation: int) -> list[str]:
-    """The command of a run that somebody has to stop."""
     options = f"--pixels 16 --batch 4 --points 16 --validation {validation} --threads 1 --steps 100000"
     return [sys.executable, "-m", "sq_perception", "train", "--output", str(folder), *options.split()]
 
@@ -144,22 +142,22 @@ class TestSchedule:
         """With a rate of almost nothing there is no progress, and a run of a million steps ends soon."""
         config = replace(RUN, schedule="plateau", learning_rate=1e-12, steps=10**6, validation=2, batch=4, average=0.0)
         train.train(config, tmp_path, SMALL)
-        records = log_of(tmp_path)
-        assert 42 <= records[-1]["step"] < 120
+        assert 42 <= log_of(tmp_path)[-1]["step"] < 120
 
 
 class TestLearning:
     def test_learns(self, tmp_path: Path) -> None:
         views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
         before = train.validate(Regressor(SMALL), views, truth).mean()
-        model = train.train(RUN, tmp_path, SMALL)
-        assert train.validate(model, views, truth).mean() > before + 0.05
-        assert [record["step"] for record in log_of(tmp_path)] == [20, 40]
+        assert train.validate(train.train(RUN, tmp_path, SMALL), views, truth).mean() > before + 0.05
+        records, header = log_of(tmp_path), checkpoint.read_header(tmp_path / "model.safetensors")
+        assert [record["step"] for record in records] == [20, 40]
+        assert json.loads(header["metrics"])["iou"] == max(record["iou"] for record in records), "the best one is kept"
+        assert json.loads(header["training"])["steps"] == 40
+        assert json.loads(header["made"])["versions"]["torch"]
 
     @pytest.mark.parametrize("loss", ["dual", "render"])
-    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(
-        self, loss: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(self, loss, tmp_path, monkeypatch) -> None:
         given = []
         compute = Objective.loss
 
@@ -184,9 +182,7 @@ def test_bfloat16_is_used_where_the_processor_has_it(monkeypatch: pytest.MonkeyP
         assert not torch.is_autocast_enabled("cpu")
 
 
-def test_a_thread_count_holds_for_network_and_rendering_and_ends_with_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_thread_count_holds_for_network_and_rendering_and_ends_with_the_run(tmp_path, monkeypatch) -> None:
     """A second thread that waits by spinning starves a run on a busy machine."""
     before, during = (torch.get_num_threads(), numba.get_num_threads()), set()
     draw = train.ViewPool.batch
@@ -234,9 +230,7 @@ class TestInterruptions:
         assert json.loads(checkpoint.read_header(tmp_path / "last.safetensors")["metrics"])["step"] >= 2
         checkpoint.load(tmp_path / "last.safetensors")
 
-    def test_divergence_keeps_the_last_good_state_and_says_so(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_divergence_keeps_the_last_good_state_and_says_so(self, tmp_path, monkeypatch) -> None:
         train.train(RUN, tmp_path, SMALL)
         before = (tmp_path / "state.safetensors").read_bytes()
         draw = train.ViewPool.batch
@@ -290,22 +284,11 @@ class TestContinuation:
         torch.testing.assert_close(saved.state_dict()[weight], model.state_dict()[weight], rtol=0, atol=1e-3)
         torch.testing.assert_close(state[f"average.{weight}"], state[f"model.{weight}"])
 
-    def test_best_network_is_kept(self, tmp_path: Path) -> None:
-        train.train(RUN, tmp_path, SMALL)
-        records = log_of(tmp_path)
-        kept = json.loads(checkpoint.read_header(tmp_path / "model.safetensors")["metrics"])
-        assert kept["iou"] == max(r["iou"] for r in records)
-        header = checkpoint.read_header(tmp_path / "model.safetensors")
-        assert json.loads(header["training"])["steps"] == 40
-        assert json.loads(header["made"])["versions"]["torch"]
-
     def test_start_from_a_file_keeps_its_form_and_learns_what_hidden_means(self, tmp_path: Path) -> None:
         checkpoint.save(tmp_path / "start.safetensors", Regressor(SMALL))
         config = replace(RUN, steps=2, start=str(tmp_path / "start.safetensors"), occluded_share=0.5, noisy_share=0.5)
-        model = train.train(config, tmp_path / "run")
-        assert model.config == replace(SMALL, marks_hidden=True)
-        record = log_of(tmp_path / "run")[-1]
-        assert {"iou", "iou_hidden", "iou_worn"} <= set(record)
+        assert train.train(config, tmp_path / "run").config == replace(SMALL, marks_hidden=True)
+        assert {"iou", "iou_hidden", "iou_worn"} <= set(log_of(tmp_path / "run")[-1])
 
     @pytest.mark.parametrize("other", [{"pixels": 48}, {"backbone": "resnet18"}, {"framing": "full"}])
     def test_a_start_of_another_form_than_is_asked_for_is_refused(self, other: dict[str, Any], tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 @pytest.fixture
 def make_bench() -> Iterator[Callable[..., Bench]]:
-    """Makes benches around nodes with these arguments."""
     from frame_node_bench import Bench  # needs rclpy; tests without it are skipped before they ask for this
 
     with ExitStack() as benches:
@@ -23,7 +22,6 @@ def make_bench() -> Iterator[Callable[..., Bench]]:
 
 @pytest.fixture
 def bench(make_bench: Callable[..., Bench]) -> Bench:
-    """One with a camera_info."""
     one = make_bench()
     one.send_info()
     return one

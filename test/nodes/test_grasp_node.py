@@ -75,7 +75,6 @@ class Bench(SpunNodes):
         self.until(lambda: any(words in entry.msg for entry in tuple(self.said)))
 
     def report(self, condition):
-        """The first report of which that holds: status and values."""
 
         def found():
             each = ((one.status[0], {pair.key: pair.value for pair in one.status[0].values}) for one in [*self.reports])

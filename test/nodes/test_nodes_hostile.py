@@ -57,8 +57,7 @@ def test_a_depth_image_and_a_mask_are_read_whole_or_refused_with_their_field(mes
 @QUICK
 @given(st.data())
 def test_a_camera_info_becomes_a_camera_or_is_refused(data):
-    info = data.draw(hostile_infos(64, 48, Header()))
-    known, words = read(intrinsics_from_message, info)
+    known, words = read(intrinsics_from_message, data.draw(hostile_infos(64, 48, Header())))
     if known is None:
         assert words.startswith("camera_info: expected ")
         return

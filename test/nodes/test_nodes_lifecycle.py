@@ -105,7 +105,6 @@ class Bench(SpunNodes):
         return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
 
     def bring_up(self) -> Bench:
-        """Configure and activate, as a manager does."""
         assert self.change(Transition.TRANSITION_CONFIGURE)
         assert self.change(Transition.TRANSITION_ACTIVATE)
         return self.active()
@@ -152,7 +151,6 @@ class Bench(SpunNodes):
         self.until(lambda: any(condition(one) for one in self.reports[-3:]))
 
     def publish_refused(self, frames: int) -> None:
-        """Publish so many that are refused, one after the other."""
         for _ in range(frames):
             before = counts_of(self.node).refused
             self.publish()
@@ -362,8 +360,7 @@ class TestSeveralCameras:
         Tf2(monkeypatch, look_up)
         bench = make_bench(namespaces=("front", "wrist")).active()
         bench.answer("wrist")
-        box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
-        bench.set(bench.nodes[1], target_frame="base", workspace=box)
+        bench.set(bench.nodes[1], target_frame="base", workspace=[-1.0, -1.0, 0.0, 1.0, 1.0, 2.0])
         bench.publish("wrist")
         bench.until(waits.is_set)
         assert bench.answer("front") == 1.0

@@ -62,8 +62,7 @@ def recover_node(peer: Peer, model: Path) -> Iterator[Child]:
 
 def test_two_nodes_on_one_camera_find_the_same_bodies(peer, children):
     first = children.start("recover_node", arguments(*QUIET, remap=("__node:=one",)))
-    second = children.start("recover_node", arguments(*QUIET, remap=("__node:=two",)))
-    alive = (first, second)
+    alive = first, children.start("recover_node", arguments(*QUIET, remap=("__node:=two",)))
     for node in ("/one", "/two"):
         peer.ask(node, *peer.frame(), alive=alive)
     image, info = peer.frame()
@@ -183,12 +182,10 @@ def test_each_of_three_is_killed_and_comes_back_while_the_others_go_on(tmp_path)
     )
     camera = ("objects:=1", "rate:=10.0", f"camera_info_file:={path}")
     with Peer() as peer, Robot(peer, camera) as robot:
-        order = np.random.default_rng(5).permutation([CAMERA_PROCESS, NODE, VIEWER])
-        for member in order:
+        for member in np.random.default_rng(5).permutation([CAMERA_PROCESS, NODE, VIEWER]):
             kill = robot.kill(str(member))
             assert kill.back < 30.0, kill  # the benchmark asks for 5, on a machine that does nothing else
             assert kill.silence < 5.0, kill
-        reports = robot.diagnoses[-1]
-        assert reports.count("refused") == 0
+        assert robot.diagnoses[-1].count("refused") == 0
     assert len(set(robot.pids)) == 6
     assert robot.left() == []

@@ -29,7 +29,7 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import outputs as outputs_module
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.outputs import OptionalOutputs, in_frame
-from sq_perception.nodes.parameters import ParameterError, RecoverParameters
+from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified
@@ -55,7 +55,6 @@ def found(*ids: int, header: Header = HEADER) -> publication.Findings:
 
 
 def shown(bodies: dict[int, Superquadric]) -> publication.Findings:
-    """Bodies by their ids."""
     identified = Identified(recovery(*(one(body, k) for k, body in bodies.items())), tuple(bodies))
     return publication.findings(identified, HEADER, is_cube=False)
 
@@ -79,7 +78,6 @@ class Publisher:
         self._matched(SimpleNamespace(current_count_change=change))
 
     def restart(self) -> None:
-        """A listener ends and comes back, between two frames."""
         self.listeners -= 1
         self.listeners += 1
 
@@ -92,8 +90,6 @@ class Publisher:
 
 
 class Node:
-    """The part of a node that outputs and poses touch."""
-
     def __init__(self) -> None:
         self.publishers: dict[str, Publisher] = {}
         self.all: list[Publisher] = []
@@ -128,7 +124,6 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Node:
 
 @pytest.fixture
 def outputs(node: Node) -> OptionalOutputs:
-    """All of them."""
     made = OptionalOutputs(node)
     made.follow(ALL)
     return made
@@ -139,7 +134,6 @@ def beside(body: Superquadric, x: float) -> Superquadric:
 
 
 def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
-    """Operation by id of a scene."""
     return {one.id: one.operation for one in publisher.sent[which].world.collision_objects}
 
 
@@ -339,17 +333,6 @@ def test_switching_off_removes_and_ending_does_not(node, outputs):
     assert len(node.publishers[SCENE].sent) == 2
 
 
-def test_meshes_are_of_the_bodies_and_larger_than_they_are(node):
-    parameters = replace(ALL, collision_shapes="mesh")
-    outputs = OptionalOutputs(node)
-    outputs.follow(parameters)
-    outputs.publish(found(3, 4), parameters)
-    for thing, body in zip(node.publishers[SCENE].sent[0].world.collision_objects, (CAN, BOX), strict=True):
-        points = np.array([[p.x, p.y, p.z] for p in thing.meshes[0].vertices])
-        gauge = Superquadric(body.size, body.shape, np.zeros(3), [0, 0, 0, 1]).gauge(points)
-        assert 1 < gauge.min() < gauge.max() < 1.03
-
-
 @pytest.mark.parametrize(("package", "topic"), [("tf2_msgs", TF), ("vision_msgs", DETECTIONS), ("moveit_msgs", SCENE)])
 def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, package, topic):
     soft_messages.remove(monkeypatch, package)
@@ -501,23 +484,6 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
     second = identified(RecoverParameters(), one(CAN, 1))
     assert (second.ids, second.hidden) == ((2,), (1,))
     assert identified(RecoverParameters(tracking=False), one(CAN, 1)).hidden == ()
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"fixed_frame": "/map"},
-        *({"target_frame": frame} for frame in ("/map", "base//link", "base link")),
-        *({"tf_prefix": prefix} for prefix in ("/body", "", "my body")),
-        *({name: "map", "projection": "orthographic"} for name in ("target_frame", "fixed_frame")),
-    ],
-)
-def test_frames_that_tf2_would_not_take_are_refused(values):
-    with pytest.raises(ParameterError, match=f"{next(iter(values))}: expected"):
-        RecoverParameters(**values)
-
-
-pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 
 def test_pictures_are_made_while_somebody_listens(bench):

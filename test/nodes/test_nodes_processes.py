@@ -23,8 +23,6 @@ BODY = BODIES[:1]
 
 
 class Process(Child):
-    """A node, started as a user starts it."""
-
     def says(self, words: str) -> None:
         until(lambda: words in self.output(), (self,))
 

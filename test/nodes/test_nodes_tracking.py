@@ -154,7 +154,6 @@ STANDS = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
 
 
 def at_stamps(poses: dict[float, Any]) -> Callable[..., Any]:
-    """Looks up poses by stamp."""
 
     def look_up(target: str, source: str, stamp: int, timeout: Any) -> Any:
         for seconds, pose in poses.items():

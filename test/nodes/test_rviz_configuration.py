@@ -43,15 +43,12 @@ def displays(configuration: dict[str, Any]) -> list[dict[str, Any]]:
     return configuration["Visualization Manager"]["Displays"]
 
 
-def test_displays_have_the_properties_of_their_classes(displays: list[dict[str, Any]]) -> None:
+def test_displays_have_the_properties_of_their_classes_and_hear_their_publishers(displays) -> None:
     for one in displays:
         assert set(one) - {"Class", "Enabled", "Name", "Value"} == PROPERTIES[one["Class"]], one["Name"]
         assert one["Value"] == one["Enabled"]
     names = [one["Name"] for one in displays]
     assert len(set(names)) == len(names)
-
-
-def test_topics_have_a_quality_of_service_that_hears_their_publishers(displays: list[dict[str, Any]]) -> None:
     for one in displays:
         if "Topic" not in one:
             continue

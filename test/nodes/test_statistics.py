@@ -1,6 +1,7 @@
 """What /diagnostics says is of the last seconds, and names what a look at the robot needs."""
 
 import re
+from types import SimpleNamespace
 
 import pytest
 
@@ -11,24 +12,15 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sq_perception.nodes.statistics import SECONDS, WITHOUT_MASK, Statistics
 
 
-class Clock:
+@pytest.fixture
+def clock() -> SimpleNamespace:
     """Seconds that pass when the test says so."""
-
-    def __init__(self) -> None:
-        self.now = 1000.0
-
-    def __call__(self) -> float:
-        return self.now
+    return SimpleNamespace(now=1000.0)
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def statistics(clock: Clock) -> Statistics:
-    return Statistics(clock)
+def statistics(clock: SimpleNamespace) -> Statistics:
+    return Statistics(lambda: clock.now)
 
 
 def said(statistics: Statistics) -> tuple[DiagnosticStatus, dict[str, str]]:
@@ -36,7 +28,7 @@ def said(statistics: Statistics) -> tuple[DiagnosticStatus, dict[str, str]]:
     return one, {pair.key: pair.value for pair in one.values}
 
 
-def frames(statistics: Statistics, clock: Clock, count: int, every: float, took: float) -> None:
+def frames(statistics: Statistics, clock: SimpleNamespace, count: int, every: float, took: float) -> None:
     for _ in range(count):
         statistics.count("received")
         clock.now += every

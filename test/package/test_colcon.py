@@ -17,7 +17,6 @@ EXECUTABLES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "
 
 
 def built(source: Path, workspace: Path, *options: str) -> Path:
-    """The install folder of a workspace with this package in src/."""
     shutil.copytree(source, workspace / "src" / PACKAGE)
     environment = {**os.environ, "COLCON_HOME": str(workspace / "home"), "COLCON_LOG_LEVEL": "30"}
     environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
@@ -34,7 +33,6 @@ def install(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 def sourced(install: Path, command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
-    """A command in a shell that has sourced the workspace."""
     environment = {**os.environ, "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
     script = '. "$0/local_setup.sh" && exec "$@"'
     return subprocess.run(
@@ -51,14 +49,11 @@ def test_package_xml_is_well_formed(repository: Path) -> None:
     assert all("@" in person.email for person in package.maintainers)
 
 
-def test_executables_are_where_ros2_run_looks(install: Path) -> None:
+def test_what_is_installed_is_where_ros_tools_look(install: Path) -> None:
     for name in EXECUTABLES:
         path = install / PACKAGE / "lib" / PACKAGE / name
         assert os.access(path, os.X_OK), path
         assert path.read_text(encoding="utf-8").startswith("#!/usr/bin/env python3\n"), "misses virtual environments"
-
-
-def test_share_is_complete(install: Path) -> None:
     share = install / PACKAGE / "share"
     assert (share / "ament_index/resource_index/packages" / PACKAGE).is_file()
     for name in ("package.xml", "launch/recover.launch.py", "config/fast_dds.xml", "config/superquadrics.rviz"):

@@ -30,7 +30,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"\s", "-", one) for one in words}
 
 
-def test_links_lead_somewhere_in_a_checkout(repository: Path) -> None:
+def test_links_lead_somewhere_in_a_checkout_and_every_page_is_in_the_navigation(repository: Path) -> None:
     broken = []
     for page in documents(repository):
         for match in _LINK.finditer(_FENCE.sub("", page.read_text(encoding="utf-8"))):
@@ -40,6 +40,11 @@ def test_links_lead_somewhere_in_a_checkout(repository: Path) -> None:
             elif match["anchor"] and target.suffix == ".md" and match["anchor"] not in anchors(target):
                 broken.append(f"{page.name}: {match[0]}: no such heading")
     assert not broken
+    text = (repository / "mkdocs.yml").read_text(encoding="utf-8")
+
+    named = re.findall(r"[\w./-]+\.md", text.partition("\nnav:")[2])
+    assert {one for one in named if "/" not in one} == {page.name for page in (repository / "docs").glob("*.md")}
+    assert len(set(named)) == len(named)
 
 
 def test_figures_and_layers_are_what_was_measured(repository: Path, monkeypatch) -> None:
@@ -65,14 +70,6 @@ def test_the_workflow_pins_what_it_runs_and_may_only_read(repository: Path) -> N
     # Both releases of OpenCV that pip may take are tested.
     assert workflow["jobs"]["test"]["strategy"]["matrix"]["opencv"] == ["4", "5"]
     assert any("opencv-python-headless==${{ matrix.opencv }}.*" in step.get("run", "") for step in steps)
-
-
-def test_every_page_is_in_the_navigation(repository: Path) -> None:
-    text = (repository / "mkdocs.yml").read_text(encoding="utf-8")
-
-    named = re.findall(r"[\w./-]+\.md", text.partition("\nnav:")[2])
-    assert {one for one in named if "/" not in one} == {page.name for page in (repository / "docs").glob("*.md")}
-    assert len(set(named)) == len(named)
 
 
 @pytest.fixture(scope="module")
@@ -112,8 +109,7 @@ def test_the_site_loads_nothing_from_elsewhere_and_links_to_files_that_are_there
         found = Loads()
         found.feed(page.read_text(encoding="utf-8"))
         assert found.loaded
-        outside = [one for one in found.loaded if re.match(r"(\w+:)?//", one)]
-        assert not outside, page.name
+        assert not [one for one in found.loaded if re.match(r"(\w+:)?//", one)], page.name
         if page.name == "404.html":  # addressed from the root, wherever it is shown
             continue
         for address in (one for one in (*found.loaded, *found.linked) if not re.match(r"\w+:|//|#", one)):

@@ -94,8 +94,7 @@ def test_the_readme_runs_as_it_stands(repository: Path, tmp_path: Path) -> None:
     assert all(body["grasps"] for body in grasps)
     assert (tmp_path / "pictures" / "table.png").is_file()
 
-    script = snippets(repository / "README.md")[0]
-    said = run_python("-c", script, cwd=tmp_path).stdout
+    said = run_python("-c", snippets(repository / "README.md")[0], cwd=tmp_path).stdout
     assert re.findall(r"^(\d) (converged|weak): full edges \[.*\] mm \+- \[.*\] mm$", said, re.MULTILINE), said
     assert (tmp_path / "table.png").read_bytes()[:4] == b"\x89PNG"
     assert (tmp_path / "table.glb").read_bytes()[:4] == b"glTF"
@@ -156,25 +155,13 @@ def test_the_reference(repository: Path, tmp_path: Path, monkeypatch: pytest.Mon
     assert (tmp_path / "cans.stl").stat().st_size > 1000
 
 
-def test_the_surface_fit(repository: Path) -> None:
+def test_the_pages_on_the_fit_sensors_and_tracking(repository: Path) -> None:
     found = run(repository, "surface_fit.md", names())["found"]
     np.testing.assert_allclose(found.superquadric.translation, BODY.translation, atol=0.03)
-
-
-def test_sensors(repository: Path) -> None:
-    given = names()
-    before = given["true_depth"]
-    measured = run(repository, "sensors.md", given)["depth"]
-    assert measured.shape == before.shape
-    assert np.nanmedian(np.abs(measured - before)) < 0.01
-
-
-def test_tracking(repository: Path) -> None:
-    from sq_perception.recovery.recoverer import Recoverer
-
-    depth = names()["depth"]
+    depth, measured = names()["true_depth"], run(repository, "sensors.md", names())["depth"]
+    assert np.nanmedian(np.abs(measured - depth)) < 0.01
     frames = [(0.1 * k, depth, np.eye(4)) for k in range(2)]
-    given = {"frames": frames, "recoverer": Recoverer(method="symmetry"), "camera": CAMERA}
+    given = {"frames": frames, "recoverer": sq_perception.Recoverer(method="symmetry"), "camera": CAMERA}
     assert run(repository, "tracking.md", given)["track"].observation == 0
 
 

@@ -1,7 +1,5 @@
 """The house rules: imports run one way, and importing does nothing but import."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator
@@ -88,9 +86,12 @@ def test_imports_run_one_way() -> None:
     assert guilty == []
 
 
-def test_only_nodes_know_ros() -> None:
+def test_only_nodes_know_ros_and_only_the_demo_runs_nodes() -> None:
     guilty = [path for path in PERCEPTION.rglob("*.py") if not is_node(path) and roots(path) & set(ROS)]
     assert guilty == []
+    others = [path for path in PERCEPTION.rglob("*.py") if not is_node(path)]
+    importing = {path for path in others if any(subpackage(name) == "nodes" for name, _ in imports(path))}
+    assert importing == {PERCEPTION / "commands" / "demo.py"}
 
 
 def test_only_nodes_bags_and_calibrations_join_the_two_packages() -> None:
@@ -122,12 +123,6 @@ def test_a_consumer_loads_neither_the_package_nor_messages_that_a_robot_may_lack
     modules = loaded_after("; ".join([absent, *(f"import sq_msgs_py.{name}" for name in names)]))
     assert {"numpy", "sq_msgs_py.shapes"} <= modules
     assert not modules & {"torch", "sq_perception", "scipy", "cv2", "numba", "rclpy"}
-
-
-def test_only_the_demo_runs_nodes() -> None:
-    others = [path for path in PERCEPTION.rglob("*.py") if not is_node(path)]
-    importing = {path for path in others if any(subpackage(name) == "nodes" for name, _ in imports(path))}
-    assert importing == {PERCEPTION / "commands" / "demo.py"}
 
 
 def test_no_module_waits_for_itself() -> None:

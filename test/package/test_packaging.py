@@ -35,7 +35,6 @@ def wheel(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def prefix(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel installed into a folder of its own."""
     folder = tmp_path_factory.mktemp("prefix")
     pip("install", "--no-deps", "--no-index", "--ignore-installed", "--no-compile", "--prefix", folder, wheel)
     return folder
@@ -52,7 +51,7 @@ def ros2_run_lookup(package: str, executable: str, prefixes: str) -> Path:
     raise LookupError(f"Package '{package}' not found")
 
 
-def test_the_wheel_carries_everything(wheel: Path) -> None:
+def test_the_wheel_carries_every_module_and_file_nothing_else_and_no_machine_path(wheel, repository) -> None:
     """Weights are real files: the pointer of a large-file store, or an empty one, would only fail at a user's start."""
     entries = zipfile.ZipFile(wheel).infolist()
     names = {entry.filename for entry in entries}
@@ -66,15 +65,9 @@ def test_the_wheel_carries_everything(wheel: Path) -> None:
     assert weights
     assert min(weights) > 100_000
     assert any(name.endswith(".yaml") and f"share/{PACKAGE}/config/" in name for name in names)
-
-
-def test_the_wheel_carries_every_module_and_nothing_else(wheel: Path, repository: Path) -> None:
     carried = {name for name in zipfile.ZipFile(wheel).namelist() if name.endswith(".py") and ".data/" not in name}
     there = (path for package in (PACKAGE, "sq_msgs_py") for path in (repository / package).rglob("*.py"))
     assert carried == {path.relative_to(repository).as_posix() for path in there}
-
-
-def test_no_machine_path_is_baked_in(wheel: Path, repository: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         for entry in archive.infolist():
             if entry.filename.endswith((".py", ".xml", ".yaml", "METADATA")) or "/lib/" in entry.filename:

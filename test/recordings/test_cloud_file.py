@@ -100,8 +100,7 @@ def test_a_cloud_in_any_order_is_seen_again(tmp_path):
     assert np.isfinite(frame.depth).mean() > 0.8
     seen = frame.camera.unproject(columns, rows, frame.depth[rows, columns])
     width = np.median(seen[:, 2]) / frame.camera.fx
-    distance = np.abs(flat[:, None] - seen[None, ::97]).sum(axis=2).min(axis=0)
-    assert np.quantile(distance, 0.9) < 2 * width
+    assert np.quantile(np.abs(flat[:, None] - seen[None, ::97]).sum(axis=2).min(axis=0), 0.9) < 2 * width
     mask = (frame.depth < 1.0).astype(np.int32)
     options = RecoveryOptions(method="symmetry", free_space=frame.has_free_space)
     (found,) = Recoverer(method="symmetry").recover(frame.depth, frame.camera, mask, options).bodies
@@ -163,8 +162,7 @@ def test_labels_of_points_are_the_masks_of_the_image(tmp_path, rng, name, field)
     assert set(np.unique(frame.labels)) == {0, 1, 2}
     assert not frame.labels[~there].any()
     rows, columns = np.nonzero(there)
-    seen = frame.camera.unproject(columns, rows, frame.depth[there])
-    nearest = cKDTree(points).query(seen)[1]
+    nearest = cKDTree(points).query(frame.camera.unproject(columns, rows, frame.depth[there]))[1]
     assert np.mean(labels[nearest] == frame.labels[there]) > 0.98, "all but those along edges"
     (box, can) = Recoverer(method="symmetry").recover(frame.depth, frame.camera, frame.labels).bodies
     assert {box.label, can.label} == {1, 2}

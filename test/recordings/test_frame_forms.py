@@ -53,8 +53,7 @@ def test_a_hostile_npy_is_refused(tmp_path):
     np.save(path, np.array([{}], dtype=object), allow_pickle=True)
     with pytest.raises(FrameError, match="objects"):
         read(path, NUMBERS)
-    whole = save(path).read_bytes()
-    path.write_bytes(whole[:-1])
+    path.write_bytes(save(path).read_bytes()[:-1])
     with pytest.raises(FrameError, match="file size"):
         read(path, NUMBERS)
 
@@ -122,8 +121,7 @@ def test_what_is_taken_of_an_image(tmp_path):
     np.savez(path, depth=depth, labels=labels, K=CAMERA.matrix)
     whole, frame = read(path), read(path, reading=Reading(nearest=0.7, farthest=1.2, region=(10, 5, 50, 40)))
     part = np.s_[5:45, 10:60]
-    is_within = (depth[part] >= 0.7) & (depth[part] <= 1.2)
-    np.testing.assert_array_equal(np.isfinite(frame.depth), is_within)
+    np.testing.assert_array_equal(np.isfinite(frame.depth), (depth[part] >= 0.7) & (depth[part] <= 1.2))
     np.testing.assert_array_equal(frame.labels, labels[part])
     points = whole.camera.unproject(np.array([20.0]), np.array([15.0]), np.array([1.0]))
     np.testing.assert_allclose(frame.camera.unproject(np.array([10.0]), np.array([10.0]), np.array([1.0])), points)

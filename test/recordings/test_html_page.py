@@ -43,7 +43,7 @@ def steps(text):
     return np.frombuffer(base64.b64decode(text), "<u2")
 
 
-def test_points_and_bodies_are_where_they_were_seen(page, shot):
+def test_points_and_bodies_are_where_they_were_seen_and_nothing_else_may_be_loaded(page, shot):
     depth, recovery = shot
     first, frame = frames(page)
     assert (first["name"], frame["name"]) == ("0: one", f"1: {HOSTILE}")
@@ -57,9 +57,6 @@ def test_points_and_bodies_are_where_they_were_seen(page, shot):
     assert (steps(points["bodies"]) == 1).all(), "every point is one of the body with number 0"
     assert frame["rows"][0][0] == "converged"
     assert " mm (+-" in frame["rows"][0][1]
-
-
-def test_the_page_forbids_the_browser_to_load_anything(page):
     text = page.read_text()
     assert HOSTILE not in text
     assert "default-src 'none'" in text
@@ -96,7 +93,6 @@ def test_a_full_disk_keeps_nothing_of_a_page(tmp_path, shot, file_size_limit, ro
 
 
 def blue(picture):
-    """Pixels in the colour of body 0: rows and columns."""
     red, green, blue = np.moveaxis(picture.astype(int), -1, 0)
     return np.nonzero((blue - red > 60) & (blue > green))
 

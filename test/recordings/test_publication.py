@@ -64,8 +64,7 @@ def test_the_axis_is_named_as_the_published_body_names_it():
 def test_deviations_are_along_and_about_the_axes_of_the_body():
     """x of the body is y of the camera: what is unsure along y of the camera is so along x of the body."""
     turned = Superquadric(BODY.size, BODY.shape, BODY.translation, [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
-    found = publication.identify(recovery(Status.CONVERGED, body=turned))
-    shown = array(found)
+    shown = array(publication.identify(recovery(Status.CONVERGED, body=turned)))
     np.testing.assert_allclose(shown.sigma_shape, [[0.03, 0.05]], rtol=1e-6)
     np.testing.assert_allclose(shown.sigma_centre, [[0.002, 0.001, 0.003]], rtol=1e-6)
     np.testing.assert_allclose(shown.sigma_turn, [[0.02, 0.03, 0.04]], rtol=1e-6)
@@ -94,8 +93,7 @@ def of_two_parts():
     frame = recovery(Status.CONVERGED)
     (body,) = frame.bodies
     made = Recovery(body.fit, 0.9, 7, 100, parts=Parts.of(fits, np.array([0.7, 0.3]), 0.001, 1.0))
-    alone = Recovery(body.fit, 0.8, 9, 90)
-    return FrameRecovery((made, alone), {}, frame.labels, None, "")
+    return FrameRecovery((made, Recovery(body.fit, 0.8, 9, 90)), {}, frame.labels, None, "")
 
 
 @pytest.mark.parametrize("is_tracked", [False, True])

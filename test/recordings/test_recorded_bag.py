@@ -67,10 +67,7 @@ def info(stamp: float, k: np.ndarray = K, size: tuple[int, int] = (160, 120), di
     )
 
 
-def write(
-    path: Path, messages: list[tuple[str, float, Any]], storage: StoragePlugin = StoragePlugin.MCAP,
-    mode: CompressionMode = CompressionMode.NONE,
-) -> Path:
+def write(path, messages, storage=StoragePlugin.MCAP, mode=CompressionMode.NONE) -> Path:
     """A bag of (topic, second of recording, message); where the message is bytes, the topic is one of images."""
     writer = Writer(path, version=9, storage_plugin=storage)
     if mode is not CompressionMode.NONE:
@@ -107,7 +104,6 @@ def recording(grey, *seconds):
 
 
 def lone(folder):
-    """The one storage file of a bag."""
     (path,) = [one for one in folder.iterdir() if one.suffix in (".mcap", ".db3")]
     return path
 
@@ -301,16 +297,12 @@ def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tm
     assert masks == [[1], [2], None, [5], [4], [4]]
 
 
-def test_images_without_a_stamp_have_no_mask(tmp_path, grey):
+def test_images_without_a_stamp_have_no_mask_and_masks_that_are_ignored_are_not_read(tmp_path, grey):
+    """Ignored ones may be a coloured picture of segments on a topic of that name."""
     mask = image(np.ones_like(grey), 0, "8UC1")
     contents = [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 0, "16UC1")), ("/mask/image", 1.1, mask)]
     assert [frame.labels for frame in frames(write(tmp_path / "bag", contents))] == [None]
-
-
-def test_masks_that_are_ignored_are_not_read(tmp_path, grey):
-    """As a coloured picture of segments on a topic of that name."""
-    colour = image(grey, 1, "rgb8")
-    path = write(tmp_path / "bag", [*recording(grey, 1), ("/mask/image", 1, colour)])
+    path = write(tmp_path / "ignored", [*recording(grey, 1), ("/mask/image", 1, image(grey, 1, "rgb8"))])
     (refused,) = frames(path)
     assert "got 'rgb8'" in str(refused)
     (frame,) = frames(path, reading=Reading(ignore_masks=True))
@@ -541,8 +533,7 @@ def test_broken_bags_cost_the_exit_code_and_nothing_else(tmp_path, grey, capsys)
     bag = write(tmp_path / "bag", [*contents, (TOPIC, 3, image(grey, 3, "16UC1"))])
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(lone(bag).read_bytes()[:-50])
-    found = recover(tmp_path, cut, bag, code=1)
-    assert [frame["stamp"]["sec"] for frame in found] == [1, 3]
+    assert [frame["stamp"]["sec"] for frame in recover(tmp_path, cut, bag, code=1)] == [1, 3]
     errors = capsys.readouterr().err
     assert f"{cut}: not a readable bag" in errors
     assert f"{TOPIC} recorded at 2.000000000" in errors

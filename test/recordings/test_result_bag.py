@@ -86,7 +86,6 @@ def messages(path):
 
 @pytest.fixture(scope="module")
 def scene():
-    """A frame of two bodies and what is recovered from it."""
     frame = RecordedFrame(depth_of(), CAMERA, None, "scene", encoding="32FC1")
     return frame, Recoverer(method="symmetry").recover(frame.depth, frame.camera)
 
@@ -208,8 +207,7 @@ def test_files_have_times_that_are_the_same_in_every_run(tmp_path):
         np.testing.assert_array_equal(message.data.view("<f4").reshape(120, 160), depth_of())
     (_, info) = found["/depth/camera_info"][0]
     np.testing.assert_array_equal(info.k.reshape(3, 3), CAMERA.matrix)
-    named = (folder / "f1.npz").rename(tmp_path / "1305031102.160407.npz")
-    recover(named, "--mcap", outs[0])
+    recover((folder / "f1.npz").rename(tmp_path / "1305031102.160407.npz"), "--mcap", outs[0])
     assert messages(outs[0])[SUPERQUADRICS][0][0] == 1305031102160407000, "a name that is a time is a stamp"
 
 
@@ -222,8 +220,7 @@ def test_grey_images_of_the_cube(tmp_path):
     recover(bag, "--projection", "orthographic", "--mcap", out, "--mcap-images", ALL)
     found = messages(out)
     assert INFO not in found
-    image = found[TOPIC][0][1]
-    np.testing.assert_array_equal(image.data.reshape(256, 256), grey)
+    np.testing.assert_array_equal(found[TOPIC][0][1].data.reshape(256, 256), grey)
     np.testing.assert_allclose(from_message(found[SUPERQUADRICS][0][1]).translation, body.translation[None], atol=0.01)
     difference = np.abs(found[RENDERED][0][1].data.reshape(256, 256).astype(int) - grey)
     assert np.median(difference[grey > 0]) <= 1
@@ -279,8 +276,7 @@ def test_a_name_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
     path = tmp_path / "1.5.npz"
     np.savez(path, depth=depth_of(), K=CAMERA.matrix)
     (tmp_path / "folder.mcap").mkdir()
-    same = record(tmp_path / "bag", [depth_of()])
-    (lone,) = same.glob("*.mcap")
+    (lone,) = record(tmp_path / "bag", [depth_of()]).glob("*.mcap")
     for source, arguments, said in (
         (path, ["--mcap", tmp_path / "nowhere" / "results.mcap"], "folder does not exist"),
         (path, ["--mcap", tmp_path / "results.bag"], "ends in .mcap"),

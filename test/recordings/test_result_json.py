@@ -130,8 +130,7 @@ def test_a_row_a_body_with_the_numbers_of_the_document():
 
 def test_equal_frames_count_one_by_one():
     done = Recovered()
-    stamped = {"file": "bag", "topic": "/depth", "stamp": {"sec": 1, "nanosec": 2}}
-    done.add([entry(0), entry(0), stamped])
+    done.add([entry(0), entry(0), {"file": "bag", "topic": "/depth", "stamp": {"sec": 1, "nanosec": 2}}])
     assert [done("0.npz", "", None) for _ in range(3)] == [True, True, False]
     assert [done("bag", "/depth", Stamp(1, 2)), done("bag", "/depth", Stamp(1, 2))] == [True, False]
     assert not done("1.npz", "", None)

@@ -1,7 +1,5 @@
 """Many crops in one call: the answers of single calls, in their order, whoever computes them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -40,20 +38,14 @@ def test_each_crop_gives_its_body(crops):
 def test_processes_answer_as_this_one_does(crops):
     depths, cameras, masks, _ = zip(*crops, strict=True)
     here = sq.recover_crops(depths, cameras, masks, OPTIONS)
-    there = sq.recover_crops(depths, cameras, masks, OPTIONS, jobs=2)
-    for one, other in zip(here, there, strict=True):
+    for one, other in zip(here, sq.recover_crops(depths, cameras, masks, OPTIONS, jobs=2), strict=True):
         np.testing.assert_allclose(one.superquadric.to_flat(), other.superquadric.to_flat(), rtol=1e-6, atol=1e-9)
 
 
-def test_a_mask_without_readings_has_no_body(crops):
+def test_a_mask_without_readings_has_no_body_and_an_image_one_camera_and_one_mask(crops):
     (depth, camera, mask, _), *_ = crops
-    empty = np.full_like(depth, np.nan)
-    assert sq.recover_crops([empty], camera, [mask], OPTIONS) == [None]
+    assert sq.recover_crops([np.full_like(depth, np.nan)], camera, [mask], OPTIONS) == [None]
     assert sq.recover_crops([], camera) == []
-
-
-def test_one_camera_and_one_mask_an_image(crops):
-    (depth, camera, mask, _), *_ = crops
     with pytest.raises(ValueError, match="for each of 2 images, got 1 and 2"):
         sq.recover_crops([depth, depth], [camera], [mask, mask])
     with pytest.raises(ValueError, match="shape"):

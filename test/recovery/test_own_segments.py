@@ -1,7 +1,5 @@
 """Own segments through the network of masks: outliers go, pieces of one thing are joined, two things stay two."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 
@@ -27,8 +25,6 @@ from sq_perception.simulation.scenes import plane_depth
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 TABLE = Table(distance=0.7)
 PLANE = TABLE.plane
-GRAIN = 7
-"""The channel of the log of the pixels to a cell's side."""
 CAN = (0.035, 0.035, 0.05), (0.1, 1.0)
 
 
@@ -57,7 +53,6 @@ class GivenLogits:
 
 
 def of(network: Any, depth: np.ndarray, camera: Camera = CAMERA, plane: np.ndarray = PLANE) -> SegmentNetwork:
-    """Before an image."""
     return SegmentNetwork(network, depth, camera, plane, lambda function, labels: function(labels))
 
 
@@ -180,11 +175,14 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     assert network.asked > 1
 
 
-def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
+def test_a_segment_that_is_surely_one_is_asked_about_once_and_no_segments_ask_nothing() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
     np.testing.assert_array_equal(of(network, depth).improve(segmentation(truth)).labels, truth)
     assert network.asked == 1
+    network = GivenLogits(lambda views: views)
+    assert of(network, depth).improve(segmentation(np.zeros_like(truth))).ids == ()
+    assert network.asked == 0
 
 
 def test_pieces_are_joined_until_none_belong_together() -> None:
@@ -206,8 +204,7 @@ def test_what_would_be_larger_than_an_object_is_not_joined(max_size: float, obje
     """Two cans, 0.19 m across together, of which each is taken for a part of the other."""
     depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
-    found = replace(of(network, depth), max_size=max_size).improve(segmentation(truth))
-    assert len(found.ids) == objects
+    assert len(replace(of(network, depth), max_size=max_size).improve(segmentation(truth)).ids) == objects
 
 
 def test_one_sided_belonging_joins_nothing() -> None:
@@ -216,11 +213,9 @@ def test_one_sided_belonging_joins_nothing() -> None:
 
     def claims_of_the_first(views: np.ndarray) -> np.ndarray:
         inside = views[..., segment_view.SEGMENT] > 0
-        claims = np.arange(len(views))[:, None, None] == 0
-        return np.where(inside | claims, 3.0, -3.0)
+        return np.where(inside | (np.arange(len(views))[:, None, None] == 0), 3.0, -3.0)
 
-    found = of(GivenLogits(claims_of_the_first), depth).improve(segmentation(truth))
-    assert sorted(found.ids) == [1, 2]
+    assert sorted(of(GivenLogits(claims_of_the_first), depth).improve(segmentation(truth)).ids) == [1, 2]
 
 
 def outliers_in_rows(share: float) -> Any:
@@ -234,15 +229,11 @@ def outliers_in_rows(share: float) -> Any:
     return GivenLogits(logits)
 
 
-def test_a_segment_that_is_mostly_outliers_keeps_its_pixels() -> None:
+def test_a_segment_that_is_mostly_outliers_keeps_its_pixels_and_one_that_shows_no_object_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(outliers_in_rows(0.55), depth).improve(replace(segmentation(truth), heights=None))
     np.testing.assert_array_equal(found.labels, truth)
     assert not found.outliers.any()
-
-
-def test_a_segment_that_shows_no_object_is_dropped() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(outliers_in_rows(0.8), depth).improve(segmentation(truth))
     assert found.ids == ()
     assert not found.labels.any()
@@ -282,15 +273,7 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     table, camera = Table(distance=1.0), Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
     bodies = [table.body(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
     depth, truth = table.see(bodies, 0.002, camera=camera)
-    found = of(shipped, depth, camera, table.plane).improve(segmentation(truth))
-    assert len(found.ids) == 5
-
-
-def test_no_segments_ask_nothing() -> None:
-    depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    network = GivenLogits(lambda views: views)
-    assert of(network, depth).improve(segmentation(np.zeros_like(truth))).ids == ()
-    assert network.asked == 0
+    assert len(of(shipped, depth, camera, table.plane).improve(segmentation(truth)).ids) == 5
 
 
 def test_frames_keep_the_outliers_in_their_labels_and_count_them() -> None:
@@ -310,8 +293,7 @@ def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quar
 
     def upper(views: np.ndarray) -> np.ndarray:
         there = (views[..., [segment_view.SEGMENT, segment_view.OTHERS]] > 0).any(axis=-1)
-        rows = np.arange(views.shape[1])[:, None]
-        return np.where(there & (rows < views.shape[1] / 2), 5.0, -5.0)
+        return np.where(there & (np.arange(views.shape[1])[:, None] < views.shape[1] / 2), 5.0, -5.0)
 
     square = Camera(240, 240, 300.0, 300.0, 119.5, 119.5)
     depth, truth = (image[:, 40:280] for image in seen([TABLE.body(0, 0, *CAN)]))
@@ -337,5 +319,4 @@ def test_mugs_side_by_side_seen_from_above_are_several(pitch, gap):
     of = np.arange(6)
     parts, cavities = Superquadric.stack(outside), Superquadric.stack(inside)
     depth, index = render_things(parts, of, cavities, of, VGA, table.plane)
-    found = Recoverer(threads=1).recover(depth.astype(np.float32), VGA).labels
-    assert min(ious(index + 1, found)) > 0.9
+    assert min(ious(index + 1, Recoverer(threads=1).recover(depth.astype(np.float32), VGA).labels)) > 0.9

@@ -1,7 +1,5 @@
 """Frames that repeat others: what stands still is not recovered again, and what changed is noticed at once."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -33,7 +31,6 @@ STILL = tuple(standing(*place) for place in PLACES)
 
 
 def image(bodies, seed, camera=CAMERA):
-    """Things on the table with the noise of a sensor."""
     return TABLE.see(bodies, 0.001, seed, camera)[0]
 
 
@@ -65,7 +62,6 @@ def first(recoverer):
 
 
 def place_of(recovery, body):
-    """Which entry of the frame is nearest to a body."""
     return int(np.argmin([np.linalg.norm(one.superquadric.translation - body.translation) for one in recovery.bodies]))
 
 
@@ -116,8 +112,7 @@ def test_a_change_is_noticed_at_once_and_the_others_stand(recoverer, first, k, b
 
 
 def test_what_is_put_down_or_taken_away_is_noticed_at_once(recoverer, first):
-    more = (*STILL, standing(0.08, 0.16, size=(0.02, 0.02, 0.025)))
-    frame = after(recoverer, first, image(more, 8))
+    frame = after(recoverer, first, image((*STILL, standing(0.08, 0.16, size=(0.02, 0.02, 0.025))), 8))
     assert sorted(one.repeats for one in frame.recovery.bodies) == [0, 1, 1, 1]
     frame = after(recoverer, frame, image(STILL[:2], 9))
     assert [one.repeats for one in frame.recovery.bodies] == [2, 2]
@@ -148,16 +143,14 @@ def test_a_thing_without_readings_is_gone_at_once_and_no_frame_after_it_fails(re
         assert len(frame.recovery.bodies) == len(STILL) - 1
         if seed == 1:
             assert [one.repeats for one in frame.recovery.bodies] == [1, 1]
-    back = after(recoverer, frame, image(STILL, 20))
-    assert len(back.recovery.bodies) == len(STILL)
+    assert len(after(recoverer, frame, image(STILL, 20)).recovery.bodies) == len(STILL)
 
 
 def test_given_segments_are_not_taken_for_own_ones(recoverer, first):
     labels = np.where(first.recovery.labels == first.recovery.bodies[0].label, 5, 0).astype(np.int32)
     given = after(recoverer, None, image(STILL, 1), labels)
     assert [one.label for one in given.recovery.bodies] == [5]
-    own = after(recoverer, given, image(STILL, 2))
-    assert len(own.recovery.bodies) == len(STILL)
+    assert len(after(recoverer, given, image(STILL, 2)).recovery.bodies) == len(STILL)
 
 
 def test_slow_motion_adds_up_until_it_is_noticed(recoverer, first):
@@ -181,16 +174,14 @@ def test_a_camera_that_moved_repeats_nothing(recoverer, first):
     for bodies in (moved((0.01, 0, 0)), moved((0, 0, 0), (0, 0, 0.03))):
         # The table is not seen to move by these: the bodies have to tell.
         assert not any(one.repeats for one in after(recoverer, first, image(bodies, 3)).recovery.bodies)
-    nearer = image(STILL, 4) - np.float32(0.004)
-    assert repeated(recoverer, first, nearer) is still_scene.NOTHING
+    assert repeated(recoverer, first, image(STILL, 4) - np.float32(0.004)) is still_scene.NOTHING
 
 
 def test_other_options_cameras_and_segments_repeat_nothing(recoverer, first):
     depth = image(STILL, 5)
     options = RecoveryOptions(method="symmetry")
     assert repeated(recoverer, first, depth, options).segmentation is not None
-    other = replace(options, max_size=0.5)
-    assert not repeated(recoverer, first, depth, other).bodies
+    assert not repeated(recoverer, first, depth, replace(options, max_size=0.5)).bodies
     assert not repeated(recoverer, first, depth, options, replace(CAMERA, cx=150.0)).bodies
     small = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
     assert not after(recoverer, first, np.full((40, 60), 1, np.float32), camera=small).recovery.bodies
@@ -215,20 +206,15 @@ def test_options_are_compared_whatever_sequences_they_are_given_as(recoverer):
     assert [one.repeats for one in frame.recovery.bodies] == [1, 1, 1]
 
 
-def test_given_masks_that_stay_repeat_too(recoverer):
+def test_given_masks_that_stay_repeat_too_unless_their_labels_are_huge(recoverer):
+    """Tables by label would be larger than the memory."""
     _, index = raycast.render(Superquadric.stack(list(STILL)), CAMERA)
     labels = (index + 1).astype(np.int32)
     before = after(recoverer, None, image(STILL, 10), labels)
     following = after(recoverer, before, image(STILL, 11), labels)
     assert [one.repeats for one in following.recovery.bodies] == [1, 1, 1]
-
-
-def test_masks_with_huge_labels_are_recovered_anew(recoverer):
-    """Tables by label would be larger than the memory."""
-    _, index = raycast.render(Superquadric.stack(list(STILL)), CAMERA)
     labels = np.where(index >= 0, 2**31 - 1 - index, 0).astype(np.int32)
-    first = after(recoverer, None, image(STILL, 0), labels)
-    again = after(recoverer, first, image(STILL, 1), labels)
+    again = after(recoverer, after(recoverer, None, image(STILL, 0), labels), image(STILL, 1), labels)
     assert sorted(body.label for body in again.recovery.bodies) == [2**31 - 3, 2**31 - 2, 2**31 - 1]
     assert not any(body.repeats for body in again.recovery.bodies)
 
@@ -262,10 +248,8 @@ def test_a_turn_takes_the_old_segments_until_they_are_old(recoverer, first):
         frame.recovery.bodies[0].superquadric.to_flat(), alone.bodies[0].superquadric.to_flat(), atol=2e-3
     )
 
-    still = after(recoverer, first, image(STILL, 2))
-    assert still.age == 1
-    old = replace(waiting, age=30)
-    frame = after(recoverer, old, image(STILL, 1))
+    assert after(recoverer, first, image(STILL, 2)).age == 1
+    frame = after(recoverer, replace(waiting, age=30), image(STILL, 1))
     assert frame.recovery.labels is not first.recovery.labels
     assert frame.age == 0
     moved = after(recoverer, waiting, image(changed(1, standing(0.02, 0.0)), 3))

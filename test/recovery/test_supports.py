@@ -1,7 +1,5 @@
 """What objects stand on: the table, or the tops of others; what stands behind another one stands on the table."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2
@@ -42,21 +40,15 @@ def test_a_box_on_a_box_stands_on_its_top(noise: float, x: float, y: float) -> N
     assert abs(above - 0.08) < 3e-3
 
 
-def test_of_three_storeys_each_stands_on_the_one_below() -> None:
+def test_each_of_three_storeys_an_egg_and_what_is_seen_from_above_stands_on_the_top_below() -> None:
+    """The lower half of the egg is unseen; the lowest that is seen of the tall box is its own top."""
     table = Table()
     bodies = [table.body(0, 0, LOW_BOX), table.body(0, 0, (0.07, 0.06, 0.03), height=0.08)]
     bodies.append(table.body(0, 0, (0.03, 0.03, 0.03), height=0.14))
     np.testing.assert_allclose(heights(table, bodies), [0, 0.08, 0.14], atol=3e-3)
-
-
-def test_an_egg_of_which_the_lower_half_is_unseen_stands_on_the_box() -> None:
     table = Table(pitch=1.1)
     egg = table.body(0, 0, (0.07, 0.035, 0.035), (1.0, 1.0), height=0.08)
     assert abs(heights(table, [table.body(0, 0, LOW_BOX), egg])[1] - 0.08) < 3e-3
-
-
-def test_a_tall_box_seen_from_straight_above_stands_on_the_top_around_it() -> None:
-    """The lowest that is seen of it is its own top."""
     table = Table(pitch=np.pi / 2 - 1e-6)
     boxes = [table.body(0, 0, LOW_BOX), table.body(0.02, 0, (0.06, 0.05, 0.08), height=0.08)]
     assert abs(heights(table, boxes)[1] - 0.08) < 3e-3

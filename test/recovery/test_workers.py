@@ -1,7 +1,5 @@
 """Frames in several processes: the same answers in the same order, whatever dies."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """Walls of bins and trays are walls; boxes, cans, books and bowls are things, however they stand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou
@@ -68,18 +66,14 @@ def test_a_plane_of_any_direction():
     tilt = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     shift = np.array([0.1, -0.2, 0.9])
     moved = {label: points @ tilt.T + shift for label, points in found.items()}
-    plane = np.append(tilt[:, 2], -tilt[:, 2] @ shift)
-    assert container_walls.walls(moved, plane) == {1, 2, 3, 4}
+    assert container_walls.walls(moved, np.append(tilt[:, 2], -tilt[:, 2] @ shift)) == {1, 2, 3, 4}
 
 
-def test_two_walls_of_a_corner_and_walls_cut_into_pieces():
+def test_walls_may_be_two_of_a_corner_or_cut_into_pieces_and_a_thing_as_high_is_none():
     wide, _, side, _ = around(0.2, 0.12)
     assert container_walls.walls(numbered([wide, side, THING]), PLANE) == {1, 2}
     left, right = wide[wide[:, 0] < -0.05], wide[wide[:, 0] > 0.02]
     assert container_walls.walls(numbered([left, right, side, THING]), PLANE) == {1, 2, 3}
-
-
-def test_a_thing_as_high_as_the_walls_is_none():
     as_high = box((-0.03, -0.02, 0), (0.03, 0.02, HIGH))
     assert container_walls.walls(numbered([*around(0.2, 0.12), as_high]), PLANE) == {1, 2, 3, 4}
 

@@ -1,6 +1,4 @@
-"""Lines of sight: free within a convex body, crossed between two; segments follow, whatever the noise bends."""
-
-from __future__ import annotations
+"""What belongs together: components at one depth, and convex parts, whose lines of sight stay free."""
 
 import numpy as np
 import pytest
@@ -9,7 +7,7 @@ from table_scenes import ious
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_parts
+from sq_perception.segmentation import convex_parts, segments
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -98,9 +96,8 @@ def behind_a_post(tilt=0.0, between=0.5):
     v, u = np.indices(depth.shape)
     x = (u - CAMERA.cx) / CAMERA.fx
     parts = [(u > 90) & (u < 140), (u > 180) & (u < 230), (u >= 140) & (u <= 180)]
-    start = (180 - CAMERA.cx) / CAMERA.fx * 0.7
     # A point (x z, y z, z) of the turned part: z - 0.7 = tan(tilt) (x z - start).
-    turned = (0.7 - np.tan(tilt) * start) / (1 - np.tan(tilt) * x)
+    turned = (0.7 - np.tan(tilt) * ((180 - CAMERA.cx) / CAMERA.fx * 0.7)) / (1 - np.tan(tilt) * x)
     for k, (where, z) in enumerate(zip(parts, (0.7, turned, between), strict=True)):
         here = where & (v > 80) & (v < 160)
         depth, labels = np.where(here, z, depth), np.where(here, k + 1, labels)
@@ -117,3 +114,48 @@ def test_a_board_goes_on_behind_what_is_nearer():
     assert left == right != post
     assert len(set(of_parts(*behind_a_post(tilt=0.5)))) == 3, "they are two faces"
     assert len(set(of_parts(*behind_a_post(between=0.9)))) == 3, "the gap shows what lies behind"
+
+
+NARROW = Camera(320, 240, 525.0, 525.0, 159.5, 119.5)
+
+
+def taken_apart(depth, sigma=1e-3):
+    depth = depth.astype(np.float32)
+    return segments.take_apart(depth, depth > 0, NARROW, sigma)
+
+
+def test_a_bridge_of_two_pixels_over_a_step_does_not_connect():
+    """Two boards, one behind the other, and a smeared edge that leads from the one to the other."""
+    depth = np.zeros((NARROW.height, NARROW.width))
+    depth[40:200, 60:150], depth[40:200, 160:250] = 0.7, 0.8
+    depth[100:102, 150:160] = np.linspace(0.7, 0.8, 12)[1:-1]
+    found = taken_apart(depth)
+    assert found[120, 100] != found[120, 200]
+    assert (found[40:200, 60:150] == found[120, 100]).all()
+    assert (found[40:200, 160:250] == found[120, 200]).all()
+
+
+def test_a_fringe_of_something_near_is_not_one_with_what_is_far_behind_it():
+    """Two strips that steps make narrow, side by side: a thing's fringe, and what is seen past it."""
+    depth = np.zeros((NARROW.height, NARROW.width))
+    depth[40:200, 150:154], depth[40:200, 154:158] = 0.7, 2.3
+    found = taken_apart(depth)
+    for label in range(1, found.max() + 1):
+        of_one = depth[found == label]
+        assert of_one.size == 0 or of_one.max() < 1.1 * of_one.min()
+
+
+def test_a_side_with_steps_from_pixel_to_pixel_is_one():
+    """Seen at a grazing angle: each column is 1.6 % farther than the last one, or more."""
+    depth = np.zeros((NARROW.height, NARROW.width))
+    depth[60:180, 100:116] = 1 / np.linspace(1 / 0.7, 1 / 0.92, 16)
+    found = taken_apart(depth, sigma=3e-3)
+    assert len(set(found[depth > 0])) == 1
+    assert found[120, 108] > 0
+
+
+def test_bits_and_nothing_have_no_label():
+    depth = np.zeros((NARROW.height, NARROW.width))
+    assert not taken_apart(depth).any()
+    depth[100:104, 100:104] = 0.7  # 5 mm
+    assert not taken_apart(depth).any()

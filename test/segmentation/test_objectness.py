@@ -1,18 +1,13 @@
 """What is a thing: its height over its whole area, what is too large and what is alone, and what is said of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
-from table_scenes import VGA, Table, best_iou, ious, judged_by_network
+from table_scenes import BOX, VGA, Table, best_iou, ious, judged_by_network
 
-from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.segmentation import objectness
 from sq_perception.segmentation.objectness import HeightEvidence
 from sq_perception.segmentation.segments import segment
-
-CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 
 
 @pytest.mark.parametrize("height", [0.004, 0.01])
@@ -64,6 +59,20 @@ def test_flat_cartons_of_unequal_thickness_are_found(sensor):
     for seed in range(2):
         depth, truth = table.sensed(bodies, sensor, seed)
         assert min(ious(truth, judged_by_network(depth, VGA).labels)) > 0.8
+
+
+@pytest.mark.parametrize(("size", "shape"), [((0.033, 0.033, 0.06), (0.1, 1.0)), ((0.05, 0.03, 0.08), BOX)])
+def test_a_label_without_readings_does_not_part_a_thing(size, shape):
+    """A dark band all around it, at several heights."""
+    table = Table(pitch=0.8, distance=0.8)
+    bodies = [table.body(0, 0, size, shape, 0.4), table.body(0.2, 0.05, (0.04, 0.03, 0.03))]
+    for seed, (top, bottom) in enumerate(((0.3, 0.5), (0.45, 0.6), (0.25, 0.6))):
+        depth, truth = table.sensed(bodies, "realsense_d435", seed)
+        rows = np.flatnonzero((truth == 1).any(axis=1))
+        first, last = (int(np.quantile(rows, share)) for share in (top, bottom))
+        depth[first:last][truth[first:last] == 1] = np.nan
+        found = judged_by_network(depth, VGA)
+        assert best_iou((truth == 1) & np.isfinite(depth), found.labels) > 0.8
 
 
 def test_a_limit_that_no_object_exceeds_changes_nothing():

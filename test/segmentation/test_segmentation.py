@@ -1,7 +1,5 @@
 """Segmentation: objects with known masks on a known plane, and images that hold none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from table_scenes import VGA, Table, best_iou, ious, noisy
@@ -51,23 +49,6 @@ def test_three_objects_on_a_table(noise):
     assert found.plane[3] == pytest.approx(PLANE[3], abs=0.002)
 
 
-def test_height_is_positive_above_the_table():
-    depth, truth = scene(THREE)
-    plane = segment(depth, CAMERA).plane
-    points = CAMERA.points(depth)
-    height = points @ plane[:3] + plane[3]
-    assert np.median(height[truth > 0]) > 0.03
-    assert np.nanmax(np.abs(height[truth == 0])) < 0.003
-
-
-def test_an_object_before_another_is_cut_at_the_depth_jump():
-    bodies = [TABLE.body(0, 0.2, (0.12, 0.03, 0.1), (0.2, 0.2)), TABLE.body(0, 0.0, (0.05, 0.03, 0.08), (0.2, 0.2))]
-    depth, truth = scene(bodies, noise=0.001)
-    found = segment(depth, CAMERA)
-    assert len(found.ids) == 2
-    assert min(best_iou(truth == k, found.labels) for k in (1, 2)) > 0.93
-
-
 def test_the_same_image_gives_the_same_objects():
     depth, _ = scene(THREE, noise=0.002)
     first, second = segment(depth, CAMERA), segment(depth, CAMERA)
@@ -75,10 +56,13 @@ def test_the_same_image_gives_the_same_objects():
     np.testing.assert_array_equal(first.plane, second.plane)
 
 
-def test_a_speck_is_no_object():
+def test_a_speck_is_no_object_and_a_noisy_empty_table_has_none():
     speck = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
     speck[100:105, 100:105] = 1.0
     assert segment(speck, CAMERA).ids == ()
+    for seed in range(5):
+        depth, _ = scene([TABLE.body(5.0, 5.0, (0.01, 0.01, 0.01), (0.2, 0.2))], noise=0.003, seed=seed)
+        assert segment(depth, CAMERA).ids == ()
 
 
 def test_options_choose():
@@ -90,36 +74,10 @@ def test_options_choose():
     assert np.nanmax(depth[near.labels > 0]) <= 1.0
 
 
-@pytest.mark.parametrize(
-    "depth",
-    [
-        table_depth().astype(np.float32),
-        np.full((240, 320), np.nan, np.float32),
-        np.zeros((240, 320), np.float32),
-        np.full((240, 320), np.inf, np.float32),
-        np.full((240, 320), 1.5, np.float32),
-        -np.ones((240, 320), np.float32),
-    ],
-    ids=["empty table", "NaN", "zero", "inf", "wall", "negative"],
-)
-def test_nothing_to_find(depth):
-    found = segment(depth, CAMERA)
-    assert found.ids == ()
-    assert not found.labels.any()
-    assert found.labels.shape == depth.shape
-    np.testing.assert_array_equal(from_labels(np.zeros(depth.shape, int), depth, CAMERA).ids, ())
-
-
 def test_labels_that_would_become_others_are_refused():
     labels = np.full((CAMERA.height, CAMERA.width), 2**32 + 2)
     with pytest.raises(ValueError, match="numbers below"):
         from_labels(labels, np.ones(labels.shape), CAMERA)
-
-
-def test_noisy_empty_table_stays_empty():
-    for seed in range(5):
-        depth, _ = scene([TABLE.body(5.0, 5.0, (0.01, 0.01, 0.01), (0.2, 0.2))], noise=0.003, seed=seed)
-        assert segment(depth, CAMERA).ids == ()
 
 
 def test_orthographic_components():

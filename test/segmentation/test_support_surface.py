@@ -1,7 +1,5 @@
 """Surfaces are no objects: tables that sensors bend, tables without a border, room corners, what stands beyond."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -131,8 +129,7 @@ def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
     v, u = np.indices(table.shape)
     board = (np.abs(u - 160) < 80) & (np.abs(v - 120) < 60)
     things = [np.hypot(u - x, v - 120) < 15 for x in (125, 195)]
-    depth = table - 0.006 * board - 0.03 * (things[0] | things[1])
-    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    found = segment(noisy(table - 0.006 * board - 0.03 * (things[0] | things[1]), 1e-3, seed), CAMERA)
     assert min(best_iou(thing, found.labels) for thing in things) > 0.8
 
 
@@ -140,8 +137,7 @@ def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
 def test_a_carton_that_the_border_cuts_is_no_furniture(away):
     """Its front fills a quarter of the image, more than a plane needs, and is most of that plane."""
     normal = slanted(45)
-    ahead = np.cross([1.0, 0.0, 0.0], normal)
-    foot = np.array([0.0, 0.0, 0.35 / np.sin(np.deg2rad(45))]) + away * ahead
+    foot = np.array([0.0, 0.0, 0.35 / np.sin(np.deg2rad(45))]) + away * np.cross([1.0, 0.0, 0.0], normal)
     carton = Superquadric(np.array([0.1, 0.04, 0.15]), np.full(2, 0.1), foot + 0.15 * normal, frame_of(normal))
     depth, truth = with_bodies(plane_image(normal, 0.35), [carton])
     assert truth[0].any()
@@ -197,16 +193,12 @@ def room_corner():
     ahead = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     left = (ahead + np.array([1.0, 0, 0])) / np.sqrt(2)
     right = (ahead - np.array([1.0, 0, 0])) / np.sqrt(2)
-    walls = [plane_image(-down, 1.0), plane_image(-left, 1.6), plane_image(-right, 1.6)]
-    return np.min(walls, axis=0)
+    return np.min([plane_image(-down, 1.0), plane_image(-left, 1.6), plane_image(-right, 1.6)], axis=0)
 
 
-def test_a_room_corner_holds_no_objects():
-    assert judged_by_network(noisy(room_corner(), 2e-3), CAMERA).ids == ()
-
-
-def test_an_empty_table_seen_from_straight_above_is_the_support():
+def test_a_room_corner_holds_no_objects_and_an_empty_table_from_straight_above_is_the_support():
     """As a wall it faces the camera, and nothing is close above it; but nothing is anywhere else."""
+    assert judged_by_network(noisy(room_corner(), 2e-3), CAMERA).ids == ()
     found = segment(noisy(np.full((240, 320), 0.9), 2e-3), CAMERA)
     assert found.plane == pytest.approx([0, 0, -1, 0.9], abs=3e-3)
     assert found.ids == ()
@@ -318,8 +310,7 @@ def test_the_largest_edge_is_that_of_the_box_and_not_its_diagonal(turn):
     points = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     up = np.array([0.0, 0.0, 1.0])
     assert largest_edge(points, up) == pytest.approx(0.4, rel=0.08)
-    wild = np.concatenate([points, [[5.0, 5.0, 5.0]]])
-    assert largest_edge(wild, up) == pytest.approx(0.4, rel=0.08)
+    assert largest_edge(np.concatenate([points, [[5.0, 5.0, 5.0]]]), up) == pytest.approx(0.4, rel=0.08)
 
 
 def test_a_narrower_frame_shows_the_same_table(shared_data):

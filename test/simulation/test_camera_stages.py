@@ -31,14 +31,11 @@ def test_the_spatial_filter_is_a_double_exponential_of_steps_below_its_threshold
     np.testing.assert_allclose(found, w[30, 0] + (w[30, -1] - w[30, 0]) * rise, atol=1e-6)
 
 
-def test_the_spatial_filter_keeps_larger_steps_and_gaps() -> None:
+def test_the_spatial_filter_keeps_planes_larger_steps_and_gaps_and_lessens_noise() -> None:
     image = step(1.0, 1.2)
     np.testing.assert_allclose(stages.spatial(image, 0.3, 0.1, 5), image, rtol=1e-6)
     image[:, 40:43] = NAN
     np.testing.assert_array_equal(np.isnan(stages.spatial(image, 0.3, 1.0, 2)), np.isnan(image))
-
-
-def test_the_spatial_filter_keeps_planes_and_lessens_noise() -> None:
     inner = np.s_[20:-20, 20:-20]  # rows begin with their first reading
     image = plane()
     np.testing.assert_allclose(stages.spatial(image, 0.5, 0.1, 2)[inner], image[inner], rtol=1e-5)
@@ -110,8 +107,7 @@ def test_alignment_keeps_planes_and_points_leave_gaps_in_finer_images() -> None:
     true = plane_depth(PLANE, finer)
     known = np.isfinite(points)
     np.testing.assert_allclose(points[known], true[known], rtol=0.01)  # half a pixel away
-    same = stages.align(plane(), CAMERA, np.zeros(3), CAMERA, True)
-    np.testing.assert_array_equal(same, plane())
+    np.testing.assert_array_equal(stages.align(plane(), CAMERA, np.zeros(3), CAMERA, True), plane())
 
 
 def test_bending_keeps_the_middle_and_grows_with_the_square() -> None:
@@ -151,7 +147,6 @@ def test_cameras_are_drawn_from_the_ranges_and_one_without_stages_changes_nothin
     np.testing.assert_array_equal(Stages().process(image, mask, CAMERA), image)
     mask[20:40, 30:50] = True
     for each in drawn[:40]:
-        found = each.process(image, mask, CAMERA)
-        inside = found[24:36, 34:46]
+        inside = each.process(image, mask, CAMERA)[24:36, 34:46]
         assert np.isfinite(inside).mean() > 0.9
         assert np.nanmax(np.abs(inside / image[24:36, 34:46] - 1)) < 0.02

@@ -33,18 +33,13 @@ def is_placed(scene: ThingsOnTable) -> np.ndarray:
     return np.isin(scene.labels, [placed.label for placed in scene.placed])
 
 
-def test_things_stand_on_the_plane(scene: tuple[str, ThingsOnTable]) -> None:
-    _, seen = scene
+def test_things_stand_on_the_plane_and_what_is_no_thing_is_furniture_floor_or_wall(scene) -> None:
+    name, seen = scene
     assert heights(seen, is_placed(seen)).min() > -1e-6
     for placed in seen.placed:
         assert placed.pixels == np.count_nonzero(seen.labels == placed.label) > 0
         down = placed.parts.support(-seen.plane[None, :3])[:, 0]
-        lowest = placed.parts.translation @ seen.plane[:3] - down + seen.plane[3]
-        assert lowest.min() > -1e-6
-
-
-def test_what_is_no_thing_is_furniture_floor_or_wall(scene: tuple[str, ThingsOnTable]) -> None:
-    name, seen = scene
+        assert (placed.parts.translation @ seen.plane[:3] - down + seen.plane[3]).min() > -1e-6
     around = heights(seen, ~is_placed(seen) & (seen.depth < seen.wall - 1e-9))
     assert np.mean(np.abs(around) < 1e-3) > 0.01  # the plane itself is in sight
     if name in LOWER:
@@ -92,33 +87,20 @@ def changed(pair: tuple[ThingsOnTable, np.ndarray]) -> tuple[np.ndarray, np.ndar
     return scene.camera.unproject(u, v, depth[v, u]), scene.camera.unproject(u, v, scene.depth[v, u])
 
 
-def test_things_stay(pair: tuple[ThingsOnTable, np.ndarray]) -> None:
+def test_things_stay_before_the_room_behind_a_floor_below_and_the_wall_of_the_scene(pair) -> None:
+    """The floor is level, 5 to 90 cm below: most readings, or many, share one height, which is the lowest."""
     scene, depth = pair
     np.testing.assert_array_equal(depth[scene.labels > 0], scene.depth[scene.labels > 0])
-
-
-def test_the_room_is_behind_the_things(pair: tuple[ThingsOnTable, np.ndarray]) -> None:
-    scene, _ = pair
     away = scene.table[:, 1]
     v, u = np.nonzero(scene.labels)
     farthest = (scene.camera.unproject(u, v, scene.depth[v, u]) @ away).max()
     now, before = changed(pair)
     assert (now @ away).min() >= farthest + 0.03 - 1e-9
     assert (before @ away).min() >= farthest + 0.03 - 1e-9
-
-
-def test_a_floor_lies_below_the_table(pair: tuple[ThingsOnTable, np.ndarray]) -> None:
-    """Level, 5 to 90 cm below: most readings, or many, share one height, which is the lowest."""
-    scene, _ = pair
-    now, _ = changed(pair)
     height = now @ scene.plane[:3] + scene.plane[3]
     floor = height.min()
     assert -0.9 <= floor <= -0.05
     assert np.mean(height < floor + 1e-6) > 0.1
-
-
-def test_the_wall_is_the_scenes(pair: tuple[ThingsOnTable, np.ndarray]) -> None:
-    scene, depth = pair
     assert 1.8 <= scene.wall <= 3.5
     assert scene.depth[scene.labels == 0].max() <= scene.wall
     assert depth.max() <= scene.wall
@@ -132,7 +114,8 @@ def scenes() -> list[ThingsOnTable]:
     return [things_on_table(np.random.default_rng([5, seed]), 5, SMALL) for seed in range(12)]
 
 
-def test_things_rest_on_the_table_or_on_each_other(scenes: list[ThingsOnTable]) -> None:
+def test_things_rest_on_the_table_or_on_each_other_and_do_not_penetrate(scenes: list[ThingsOnTable]) -> None:
+    """No point of one hull's parts is inside of another thing's parts."""
     rests = [placed.rest for scene in scenes for placed in scene.placed]
     assert {"standing", "lying"} <= set(rests)
     assert any(rest.startswith("stacked") for rest in rests)
@@ -144,10 +127,6 @@ def test_things_rest_on_the_table_or_on_each_other(scenes: list[ThingsOnTable]) 
                 assert lowest > 0.005
             else:
                 assert abs(lowest) < 1e-9
-
-
-def test_things_do_not_penetrate(scenes: list[ThingsOnTable]) -> None:
-    """No point of one hull's parts is inside of another thing's parts."""
     rng = np.random.default_rng(1)
     for scene in scenes[:6]:
         surfaces = [placed.parts.sample_surface(300, rng, oversampling=2).reshape(-1, 3) for placed in scene.placed]

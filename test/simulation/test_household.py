@@ -15,19 +15,6 @@ MEASURES = {
 """Longest edges of a thing's box, metres."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_support_function_is_that_of_points_of_the_hull(kind: str) -> None:
-    rng = np.random.default_rng(3)
-    for _ in range(2):
-        thing = draw_thing(rng, [kind])
-        reach = thing.support(DIRECTIONS)
-        points = thing.parts.sample_surface(4000, rng, oversampling=2).reshape(-1, 3)
-        sampled = (points @ DIRECTIONS.T).max(axis=0)
-        size = np.linalg.norm(thing.box[1] - thing.box[0])
-        assert (sampled <= reach + 1e-9).all()
-        assert (reach - sampled).max() < 0.03 * size
-
-
 def test_the_compiled_support_function_is_the_closed_form() -> None:
     rng = np.random.default_rng(0)
     size, shape = rng.uniform(0.1, 2, (50, 3)), rng.uniform(0.03, 1.9, (50, 2))

@@ -10,7 +10,6 @@ pytest.importorskip("shape_msgs", reason="message packages missing: install the 
 
 from shape_msgs.msg import SolidPrimitive
 
-from sq_msgs_py import shapes
 from sq_msgs_py.shapes import BOX, CYLINDER, SPHERE, Primitive, enclosing_factor, mesh_message, primitive, primitives
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, mesh
 from sq_perception.geometry.superquadric import Superquadric
@@ -81,21 +80,13 @@ def test_messages_have_the_order_of_dimensions_that_shape_msgs_asks_for():
     assert ball.dimensions[SolidPrimitive.SPHERE_RADIUS] == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize("e", [0.1, 0.7, 0.999999, 1.0, 1.000001, 1.5, 2.0])
-def test_the_largest_is_that_of_a_fine_search(e):
-    u = np.linspace(0, 1, 200001)
-    values = 0.3 * u**e + 0.5 * (1 - u) ** e
-    assert shapes._largest(0.3, 0.5, e) == pytest.approx(values.max(), rel=1e-6)
-
-
 def test_solids_enclose_their_bodies_and_touch_them():
     rng = np.random.default_rng(6)
     kinds = set()
     for one in random_bodies(120):
         solid = primitive(one.size, one.shape)
         kinds.add(solid.kind)
-        over = overshoot(solid, surface(one, rng))
-        assert -0.01 < over <= 1e-12
+        assert -0.01 < overshoot(solid, surface(one, rng)) <= 1e-12
         volume = {BOX: np.prod(2 * one.size)}
         if solid.kind == CYLINDER:
             volume[CYLINDER] = np.pi * solid.dimensions[1] ** 2 * solid.dimensions[0]
@@ -131,8 +122,7 @@ def test_an_octahedron_is_its_own_mesh():
     faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
     assert enclosing_factor(vertices, np.array(faces), SIZE, (2.0, 2.0)) == pytest.approx(1, abs=1e-12)
     # The ball through its six corners reaches sqrt(3) beyond the middle of its faces.
-    factor = enclosing_factor(vertices, np.array(faces), SIZE, (1.0, 1.0))
-    assert factor == pytest.approx(np.sqrt(3))
+    assert enclosing_factor(vertices, np.array(faces), SIZE, (1.0, 1.0)) == pytest.approx(np.sqrt(3))
     with pytest.raises(ValueError, match="outwards"):
         enclosing_factor(vertices, np.array(faces)[:, ::-1], SIZE, (2.0, 2.0))
     with pytest.raises(ValueError, match="outwards"):

@@ -64,7 +64,7 @@ def test_moving_an_array_is_moving_its_bodies():
     np.testing.assert_allclose(np.abs(np.sum(again.rotation * array.rotation, axis=1)), 1, atol=1e-6)
 
 
-def test_covariances_turn_with_the_frame():
+def test_covariances_turn_with_the_frame_an_empty_array_moves_and_a_header_keeps_its_stamp():
     rng = np.random.default_rng(4)
     turn = quaternions.random(1, rng)[0]
     factor = rng.normal(size=(2, 6, 6))
@@ -74,9 +74,6 @@ def test_covariances_turn_with_the_frame():
     change[:3, :3] = change[3:, 3:] = quaternions.to_matrix(turn)
     np.testing.assert_allclose(found, [change @ one @ change.T for one in known], atol=1e-12)
     assert np.isnan(poses.turn_covariances(np.full((1, 6, 6), np.nan), turn)).all()
-
-
-def test_an_empty_array_moves_and_a_header_keeps_its_stamp():
     assert len(poses.move(SuperquadricArray.empty(), QUARTER_ABOUT_Z, np.zeros(3))) == 0
     header = poses.header_in(HEADER, "map")
     assert (header.frame_id, header.stamp) == ("map", HEADER.stamp)
@@ -109,7 +106,7 @@ def test_frames_of_bodies_that_did_not_fail():
         transforms(three(), Header())
 
 
-def test_detections_say_full_sizes_scores_and_names():
+def test_detections_say_full_sizes_scores_names_and_the_covariances_that_are_known():
     message = detections(three(), HEADER, prefix="body")
     assert message.header == HEADER
     box, can = message.detections
@@ -123,9 +120,6 @@ def test_detections_say_full_sizes_scores_and_names():
     assert can.results[0].hypothesis.score == 0.0, "unknown"
     assert not np.any(result.pose.covariance)
     assert detections(SuperquadricArray.empty(), HEADER).detections == []
-
-
-def test_detections_carry_the_covariances_that_are_known():
     known = np.full((3, 6, 6), np.nan)
     known[0] = np.arange(36).reshape(6, 6)
     box, can = detections(three(), HEADER, covariances=known).detections
@@ -204,13 +198,6 @@ def test_a_round_body_at_rest_is_sent_once():
     assert len(scene.changes(box, HEADER)) == 1
     swapped = replace(box, size=box.size[:, [1, 0, 2]], rotation=poses.product(box.rotation, QUARTER_ABOUT_Z))
     assert scene.changes(swapped, HEADER) == [], "a quarter turn of a box whose edges swap is the same box"
-
-
-@pytest.mark.parametrize(("package", "make"), [("vision_msgs", detections), ("moveit_msgs", collision_objects)])
-def test_without_the_package_only_the_call_fails(monkeypatch, package, make):
-    soft_messages.remove(monkeypatch, package)
-    with pytest.raises(ImportError):
-        make(three(), HEADER)
 
 
 @pytest.mark.parametrize("normal", [[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, -1, 0], [0.1, -0.8, -0.59]])

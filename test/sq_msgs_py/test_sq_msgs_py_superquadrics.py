@@ -167,8 +167,7 @@ TETRAHEDRON = (
 
 
 def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
-    message = markers([TETRAHEDRON], [5], HEADER, namespace="body", alpha=0.5)
-    before, surface, outline = message.markers
+    before, surface, outline = markers([TETRAHEDRON], [5], HEADER, namespace="body", alpha=0.5).markers
     assert before.action == Marker.DELETEALL
     assert (surface.ns, surface.id, surface.type) == ("body/surface", 5, Marker.TRIANGLE_LIST)
     assert surface.action == Marker.ADD

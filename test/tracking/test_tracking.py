@@ -52,8 +52,7 @@ def test_ids_survive_a_crossing(same):
             if k == 0:
                 expected = {t.id: order[t.observation] for t in tracks}
             assert {t.id: order[t.observation] for t in tracks} == expected
-        speed = np.linalg.norm(tracks[0].velocity)
-        assert 0.3 < speed < 0.6
+        assert 0.3 < np.linalg.norm(tracks[0].velocity) < 0.6
 
 
 def test_ids_survive_an_occlusion_but_not_an_absence(rng):
@@ -78,12 +77,21 @@ def test_ids_survive_an_occlusion_but_not_an_absence(rng):
     assert [t.id for t in tracks] == [1, 3]
 
 
-def test_what_is_there_but_was_not_recovered_does_not_die(rng):
+def test_what_is_hidden_or_not_recovered_does_not_die_but_lives_not_for_ever(rng):
     truth, tracker = body(), Tracker()
     depth = image_of(truth)
     for k in range(20):
         tracks = tracker.update([draw(truth, noise(), rng)] if k < 4 else [], k / 30, camera=CAMERA, depth=depth)
     assert [t.state for t in tracks] == [TrackState.LOST]
+    tracker = Tracker()
+    tracker.update([draw(body(), noise(), rng)], 0.0)
+    assert len(tracker.update([], FORGET_AFTER - 0.1, camera=CAMERA, depth=NOTHING)) == 1
+    assert tracker.update([], FORGET_AFTER + 0.1, camera=CAMERA, depth=NOTHING) == ()
+    tracker, masked = Tracker(), np.ma.masked_array(np.full((CAMERA.height, CAMERA.width), 9.0), True)
+    tracker.update([draw(body(), noise(), rng)], 0.0)
+    for k in range(1, 60):
+        tracks = tracker.update([], FORGET_AFTER * k / 100, camera=CAMERA, depth=masked)
+    assert len(tracks) == 1
 
 
 STRAIGHT = {"turn": (0, 0, 0)}
@@ -109,13 +117,6 @@ def test_what_is_recovered_no_more_lives_as_long_as_the_image_shows_it(rng, stay
         seen = [draw(each, noise(), rng) for each in ([stays, other] if k < 4 else [stays])]
         tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
     assert [t.id for t in tracks] == ([1, 2] if lives else [1])
-
-
-def test_nothing_hidden_lives_for_ever(rng):
-    tracker = Tracker()
-    tracker.update([draw(body(), noise(), rng)], 0.0)
-    assert len(tracker.update([], FORGET_AFTER - 0.1, camera=CAMERA, depth=NOTHING)) == 1
-    assert tracker.update([], FORGET_AFTER + 0.1, camera=CAMERA, depth=NOTHING) == ()
 
 
 def test_a_new_body_is_tentative_first(rng):
@@ -146,15 +147,6 @@ def test_a_moved_body_is_the_same_in_another_place(rng):
     assert tracks[0].seen == 30
     assert not tracks[0].velocity.any()
     assert np.abs(error_of(tracks[0], truth)[0][:3]).max() < 0.04
-
-
-def test_a_body_set_down_at_once_does_not_run_on(rng):
-    """20 cm in a fifth of a second, then at rest, 10 frames a second: no velocity is made up, no id lost."""
-    tracker = Tracker()
-    for k in range(10):
-        tracks = tracker.update([draw(body(centre=(0.2 * (k > 5), 0, 0.8)), noise(), rng)], 0.25 * k)
-        assert [t.id for t in tracks] == [1]
-        assert not tracks[0].velocity.any()
 
 
 def test_a_hidden_body_does_not_lend_its_id_to_its_like(rng):
@@ -221,14 +213,15 @@ def test_another_body_elsewhere_is_another_one_and_a_long_gap_forgets_the_pose_a
 
 
 def test_a_motion_of_the_world_changes_nothing(rng):
-    """All poses moved rigidly: the same numbers, moved."""
+    """All poses moved rigidly: the same numbers, moved, also of a first look that leaves one direction open."""
     turn, shift = quaternions.random(1, rng)[0], np.array([1.0, -2.0, 0.5])
     truths = spread_bodies(4, rng)
     here, there = Tracker(), Tracker()
     for k in range(12):
         pose = looking_at(truths.translation.mean(axis=0), np.array([np.sin(0.2 * k), 0.3, -np.cos(0.2 * k)]), 2.0)
         shown = truths if k != 6 else truths[:3]
-        seen = [from_camera(draw(t, correlated(rng), rng), *pose) for t in shown]
+        loose = np.diag([0.0] * 7 + [(k == 0) * 0.02**2] + [0.0] * 3)
+        seen = [from_camera(draw(t, correlated(rng) + loose, rng), *pose) for t in shown]
         matrix = np.eye(4)
         matrix[:3, :3] = quaternions.to_matrix(quaternions.multiply(turn, pose[0]))
         matrix[:3, 3] = quaternions.to_matrix(turn) @ pose[1] + shift
@@ -239,20 +232,6 @@ def test_a_motion_of_the_world_changes_nothing(rng):
             np.testing.assert_allclose(state.difference(carried.to_flat(), b.superquadric.to_flat()), 0, atol=1e-7)
             expected = state.rotate(a.covariance, quaternions.to_matrix(turn))
             np.testing.assert_allclose(b.covariance, expected, atol=1e-9)
-
-
-def test_a_turn_of_the_world_changes_no_second_look(rng):
-    """The first look leaves one direction of the centre open, the second one does not: whatever the world's axes."""
-    turn, here, there = quaternions.random(1, rng)[0], Tracker(), Tracker()
-    loose, sure = noise(), noise()
-    loose[7, 7] = 0.02**2
-    for k in range(6):
-        seen = [draw(body(), loose if k == 0 else sure, rng, form=0)]
-        (one,), (other,) = here.update(seen, 0.1 * k), there.update(seen, 0.1 * k, (turn, np.zeros(3)))
-        carried = one.superquadric.transformed(turn, np.zeros(3))
-        np.testing.assert_allclose(state.difference(carried.to_flat(), other.superquadric.to_flat()), 0, atol=1e-9)
-        expected = state.rotate(one.covariance, quaternions.to_matrix(turn))
-        np.testing.assert_allclose(other.covariance, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("speed", [0.4, 0.6, 0.7, 0.8, 0.95])
@@ -282,14 +261,6 @@ def test_what_is_gone_is_seen_to_have_gone_by_an_image_of_single_readings(nothin
     depth = np.where((row % 3 == 1) & (column % 3 == 1), 2.0, nothing)
     bodies = Superquadric.stack([body(), body(centre=(0.05, 0.03, 0.7)), body(centre=(0, 0, 3))])
     np.testing.assert_array_equal(visibility.open_share(bodies, CAMERA, depth), [1, 1, 0])
-
-
-def test_masked_readings_are_no_empty_space(rng):
-    tracker, masked = Tracker(), np.ma.masked_array(np.full((CAMERA.height, CAMERA.width), 9.0), True)
-    tracker.update([draw(body(), noise(), rng)], 0.0)
-    for k in range(1, 60):
-        tracks = tracker.update([], FORGET_AFTER * k / 100, camera=CAMERA, depth=masked)
-    assert len(tracks) == 1
 
 
 @pytest.mark.parametrize(
@@ -381,12 +352,9 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
     assert len(named) > 2
 
 
-def test_the_limits_of_chi_squared_are_scipys():
+def test_limits_of_chi_squared_and_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
     for freedom, limit in association.LIMITS.items():
         assert limit == pytest.approx(chi2.ppf(0.999, freedom), rel=1e-12)
-
-
-def test_the_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
     for _ in range(300):
         cost = rng.normal(size=np.sort(rng.integers(1, 9, 2)))
         cost[rng.random(cost.shape) < 0.5] = 2.0
