@@ -239,7 +239,7 @@ def draw(pixels: np.ndarray, reach: np.ndarray, count: int, offset: float) -> np
     if len(pixels) <= count:
         return pixels
     chosen = np.searchsorted(reach, (np.arange(count) + offset) * (reach[-1] / count), side="right")
-    return pixels[np.unique(np.minimum(chosen, len(pixels) - 1))]
+    return pixels[chosen[np.diff(chosen, prepend=-1) > 0]]  # each once
 
 
 @kernel
