@@ -109,7 +109,6 @@ PARTS: dict[str, Part] = {
     "lost edge": _without(surface_fit, drop_lost_edge=lambda problem, state: (problem, state)),
     "more rays under noise": _without(surface_fit, _MOST_FINAL_RAYS=surface_fit._FINAL_RAYS),
     "starts turned by 45 degrees": _without(starts, eighth_turns=lambda _: np.empty((0, 3, 3))),
-    "other exponents of starts": _without(starts, _EXPONENTS=()),
     "a superquadric of a thing": _without(surface_fit, _is_explained=lambda *_: False, _FINE_NOISE=0.0),
     "the thing as an alternative": _without(surface_fit, _AS_A_THING=0.0),
 }

@@ -146,32 +146,6 @@ def rays_of(points: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def draw(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
-    """All of the pixels (n,), or about ``count`` of them, systematically by their areas.
-
-    Other offsets (0 to 1) take other pixels.
-    """
-    if pixels.shape[0] <= count:
-        return pixels
-    total = 0.0
-    for i in range(areas.shape[0]):
-        total += areas[i]
-    chosen = np.empty(count, np.int32)
-    step = total / count
-    ahead = step * offset
-    passed = 0.0
-    k = 0
-    for i in range(pixels.shape[0]):
-        passed += areas[i]
-        if passed > ahead and k < count:
-            chosen[k] = pixels[i]
-            k += 1
-            while passed > ahead:
-                ahead += step
-    return chosen[:k]
-
-
-@kernel
 def rays_through(
     pixels: np.ndarray, depth: np.ndarray, lens: Lens, noise: float, model_error: float, margin: float
 ) -> np.ndarray:

@@ -36,8 +36,8 @@ from sq_perception.fitting.quality import fail
 from sq_perception.fitting.starts import START_EXPONENT, boxes, principal_axes
 
 MOST_PARTS = 6
-_POINTS, _PROBES = 800, 800
-"""Points, and probes of both sides together, that parts are fitted to."""
+_POINTS = 800
+"""Points that parts are fitted to, and probes of both sides together."""
 _WITNESSES = 600.0
 """n_e above."""
 _RESOLUTION = 0.01
@@ -115,14 +115,8 @@ class _Search:
     def prune(self, mixture: Mixture) -> Mixture:
         """The union without the bodies that do not shorten its description."""
         while len(mixture.bodies) > 1:
-            fewer = [
-                self._maximize(
-                    mixture._replace(bodies=np.delete(mixture.bodies, k, 0), turns=np.delete(mixture.turns, k, 0)),
-                    _THOROUGH,
-                )
-                for k in range(len(mixture.bodies))
-            ]
-            shortest = min(fewer, key=self.description)
+            fewer = (_without(mixture, k) for k in range(len(mixture.bodies)))
+            shortest = min((self._maximize(each, _THOROUGH) for each in fewer), key=self.description)
             if self.description(shortest) >= self.description(mixture):
                 break
             mixture = shortest
@@ -138,35 +132,35 @@ class _Search:
         return point_cost.maximize(self._data, mixture, points.PRIOR, self._limits, course)
 
     def _candidates(self, mixture: Mixture) -> Iterator[Mixture]:
-        bodies, turns = mixture.bodies, mixture.turns
         wide = mixture._replace(sigma=max(mixture.sigma, 2 * _RESOLUTION))
-        for k in range(len(bodies)):
+        for k, (body, turn) in enumerate(zip(mixture.bodies, mixture.turns, strict=True)):
             for axis in range(3):
-                halves = np.repeat(bodies[k][None], 2, axis=0)
+                halves = np.stack([body, body])
                 halves[:, axis] *= 0.5
                 halves[:, 8:] = 0.0
-                step = turns[k][:, axis] * halves[0, axis]
-                halves[0, 5:8] -= step
-                halves[1, 5:8] += step
-                rest = np.delete(bodies, k, 0), np.delete(turns, k, 0)
-                both = np.repeat(turns[k][None], 2, axis=0)
-                yield wide._replace(bodies=np.concatenate([rest[0], halves]), turns=np.concatenate([rest[1], both]))
-        of_points = self._nearest(self._data.points, mixture)
+                halves[:, 5:8] += np.outer([-1.0, 1.0], turn[:, axis] * halves[0, axis])
+                yield _with(_without(wide, k), halves, np.stack([turn, turn]))
+        of_points = _nearest(self._data.points, mixture)
         unexplained = self._data.points[np.abs(of_points) > 2 * mixture.sigma]
         within = self._data.probes[self._data.sides < 0]
-        unfilled = within[self._nearest(within, mixture) > 0] if len(within) else within
+        unfilled = within[_nearest(within, mixture) > 0] if len(within) else within
         for some in (unexplained, unfilled):
             if (box := _box_of_group(some)) is not None:
-                yield wide._replace(
-                    bodies=np.append(bodies, [box.parameters], 0), turns=np.append(turns, [box.rotation], 0)
-                )
+                yield _with(wide, box.parameters[None], box.rotation[None])
 
-    @staticmethod
-    def _nearest(some: np.ndarray, mixture: Mixture) -> np.ndarray:
-        return np.min(
-            [point_cost.distances(some, body, turn) for body, turn in zip(mixture.bodies, mixture.turns, strict=True)],
-            axis=0,
-        )
+
+def _without(mixture: Mixture, k: int) -> Mixture:
+    return mixture._replace(bodies=np.delete(mixture.bodies, k, 0), turns=np.delete(mixture.turns, k, 0))
+
+
+def _with(mixture: Mixture, bodies: np.ndarray, turns: np.ndarray) -> Mixture:
+    return mixture._replace(bodies=np.append(mixture.bodies, bodies, 0), turns=np.append(mixture.turns, turns, 0))
+
+
+def _nearest(some: np.ndarray, mixture: Mixture) -> np.ndarray:
+    """Distance (n,) of some points to the nearest body."""
+    pairs = zip(mixture.bodies, mixture.turns, strict=True)
+    return np.min([point_cost.distances(some, body, turn) for body, turn in pairs], axis=0)
 
 
 def _box_of_group(some: np.ndarray) -> State | None:
@@ -205,7 +199,7 @@ def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:
     probes, sides = [], []
     for cell, sign in ((outside, 1.0), (inside, -1.0)):
         at = np.argwhere(cell)
-        at = at[:: max(1, len(at) * 2 // _PROBES)]
+        at = at[:: max(1, len(at) * 2 // _POINTS)]
         probes.append((at - 2) * side + low)
         sides.append(np.full(len(at), sign))
     weight = 0.5 / (2 * _RESOLUTION) ** 2

@@ -32,13 +32,8 @@ Lane = IntEnum(
 ROWS = len(Lane)
 _VECTOR = 8
 """Doubles of the longest vectors of today's processors, 512 bits."""
-
-_HIT_STEPS = 12
-"""Most steps of Newton's method on a convex function; it converges quadratically, most rays need 2."""
-_LOWEST_STEPS, LOWEST_TOLERANCE = 20, 1e-9
-"""Most steps to the smallest gauge on a ray, and how near to a lower bound of it they end."""
-_FAR_OUTSIDE = 2.0
-"""Gauge above which Newton's method starts where the ray enters the bounding box instead."""
+LOWEST_TOLERANCE = 1e-9
+"""How near to a lower bound of the smallest gauge on a ray the search for it ends."""
 
 
 @kernel
@@ -108,68 +103,65 @@ def meet(
     """
     gauge_along(filled, parameters, lanes)
     for i in range(filled):
-        missed[i] = lanes[Lane.SLOPE, i] >= 0.0 or lanes[Lane.G, i] > _FAR_OUTSIDE
-    for _ in range(_HIT_STEPS):
-        moving = 0
-        for i in range(filled):
-            over = 1.0 - lanes[Lane.G, i]
-            moves = abs(over) >= tolerance and lanes[Lane.SLOPE, i] < 0.0 and not missed[i]
-            lanes[Lane.SHIFT, i] += over / lanes[Lane.SLOPE, i] if moves else 0.0
-            moving += moves
-        if moving == 0:
-            break
-        gauge_along(filled, parameters, lanes)
-        for i in range(filled):
-            missed[i] = missed[i] or lanes[Lane.SLOPE, i] >= 0.0
+        missed[i] = lanes[Lane.SLOPE, i] >= 0.0 or lanes[Lane.G, i] > 2.0
+    _approach(filled, tolerance, parameters, lanes, missed)
     count = 0
     for i in range(filled):
+        missed[i] = missed[i] or lanes[Lane.SLOPE, i] >= 0.0
         if missed[i]:
             for row in range(Lane.QX, Lane.SHIFT):
                 again[row, count] = lanes[row, i]
             count += 1
     if count == 0:
         return
-    _meet_from_box(padded(count, again), tolerance, parameters, again)
+    beside = np.empty(LANES, np.bool_)
+    _meet_from_box(padded(count, again), tolerance, parameters, again, beside)
     count = 0
     for i in range(filled):
         if missed[i]:
             for row in range(Lane.SHIFT, Lane.MEASURED):
                 lanes[row, i] = again[row, count]
-            missed[i] = again[Lane.SHARE, count] == 0.0
+            missed[i] = beside[count]
             count += 1
 
 
 @kernel
-def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> None:
-    """As :func:`meet`, from where the rays enter the bounding box; SHARE is 1 for rays that meet the surface, else
-    0."""
-    for i in range(filled):
-        qx, qy, qz = lanes[Lane.QX, i], lanes[Lane.QY, i], lanes[Lane.QZ, i]
-        ex, ey, ez = lanes[Lane.EX, i], lanes[Lane.EY, i], lanes[Lane.EZ, i]
-        t_in, t_out = inside_box((qx, qy, qz), (ex, ey, ez), form_of(parameters))
-        inside = t_in <= t_out
-        lanes[Lane.SHARE, i] = 1.0 if inside else 0.0
-        lanes[Lane.SHIFT, i] = lanes[Lane.LOW, i] = t_in if inside else 0.0
-    gauge_along(filled, parameters, lanes)
-    for _ in range(_HIT_STEPS):
+def _approach(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray) -> None:
+    """Go by Newton's method towards the surface along rays that do not miss, while g falls; LOW is the point before."""
+    for _ in range(12):  # at most: it converges quadratically, most rays need 2
         moving = 0
         for i in range(filled):
-            is_off = lanes[Lane.SHARE, i] > 0.0 and abs(lanes[Lane.G, i] - 1.0) >= tolerance
-            moves = is_off and lanes[Lane.SLOPE, i] < 0.0
+            over = 1.0 - lanes[Lane.G, i]
+            moves = abs(over) >= tolerance and lanes[Lane.SLOPE, i] < 0.0 and not missed[i]
             lanes[Lane.LOW, i] = lanes[Lane.SHIFT, i] if moves else lanes[Lane.LOW, i]
-            lanes[Lane.SHIFT, i] += (1.0 - lanes[Lane.G, i]) / lanes[Lane.SLOPE, i] if moves else 0.0
+            lanes[Lane.SHIFT, i] += over / lanes[Lane.SLOPE, i] if moves else 0.0
             moving += moves
         if moving == 0:
             break
         gauge_along(filled, parameters, lanes)
+
+
+@kernel
+def _meet_from_box(
+    filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray
+) -> None:
+    """As :func:`meet`, from where the rays enter the bounding box."""
+    for i in range(filled):
+        qx, qy, qz = lanes[Lane.QX, i], lanes[Lane.QY, i], lanes[Lane.QZ, i]
+        ex, ey, ez = lanes[Lane.EX, i], lanes[Lane.EY, i], lanes[Lane.EZ, i]
+        t_in, t_out = inside_box((qx, qy, qz), (ex, ey, ez), form_of(parameters))
+        missed[i] = not t_in <= t_out
+        lanes[Lane.SHIFT, i] = lanes[Lane.LOW, i] = 0.0 if missed[i] else t_in
+    gauge_along(filled, parameters, lanes)
+    _approach(filled, tolerance, parameters, lanes, missed)
     # Newton's method passes the smallest g of a ray that misses: it lies between the last two points.
     passed = 0
     for i in range(filled):
-        is_off = lanes[Lane.SHARE, i] > 0.0 and abs(lanes[Lane.G, i] - 1.0) >= tolerance
+        is_off = not missed[i] and abs(lanes[Lane.G, i] - 1.0) >= tolerance
         open_bracket = is_off and lanes[Lane.SLOPE, i] >= 0.0
         lanes[Lane.HIGH, i] = lanes[Lane.SHIFT, i]
         lanes[Lane.LOW, i] = lanes[Lane.LOW, i] if open_bracket else lanes[Lane.SHIFT, i]
-        lanes[Lane.SHARE, i] = 0.0 if open_bracket else lanes[Lane.SHARE, i]
+        missed[i] = missed[i] or open_bracket
         passed += open_bracket
     if passed > 0:
         above = np.empty(LANES, np.bool_)
@@ -222,7 +214,7 @@ def lowest(
         elif lanes[Lane.S_HIGH, i] <= 0.0:
             lanes[Lane.LOW, i] = lanes[Lane.HIGH, i]
         lanes[Lane.SHIFT, i] = lanes[Lane.HIGH, i]
-    for step in range(_LOWEST_STEPS):
+    for step in range(20):  # at most
         searching = 0
         for i in range(filled):
             low, high, shift = lanes[Lane.LOW, i], lanes[Lane.HIGH, i], lanes[Lane.SHIFT, i]

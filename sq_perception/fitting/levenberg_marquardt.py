@@ -23,12 +23,8 @@ from sq_perception.geometry.superquadric import Superquadric
 
 _LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
 """Largest changes in one step: beyond, residuals are no longer linear.  A shift is limited to the largest half size."""
-_FIRST_DAMPING = 1e-3
-"""First lambda: tau of Madsen et al. for starts that are believed to be good."""
 _WORSE, _BETTER = 7.0, 0.12
 """Factors of the damping after a step that was refused and one that was taken."""
-_ATTEMPTS = 6
-"""Steps refused in a row, damping growing 10^5 fold, before the search ends."""
 _LEAST_COST = 1e-12
 """Least cost that a gain is taken as a share of: a body that leaves nothing at all has no gain to go on for."""
 
@@ -79,13 +75,13 @@ def minimize(
     next_rotation = rotation.copy()
     met = rays[:, Ray.DEPTH].copy()
     cost = evaluate(stage, rays, free, terms, parameters, rotation, met, sums)
-    damping = _FIRST_DAMPING
+    damping = 1e-3  # tau of Madsen et al. for starts that are believed to be good
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
         hold(parameters, lower, upper, sums[STEP_LENGTH], held)
         accepted = False
-        for _ in range(_ATTEMPTS):
+        for _ in range(6):  # in which damping grows 10^5 fold
             if solve_damped(sums, damping, held, factor, step):
                 if _promised(sums, step) <= tolerance * max(abs(cost), _LEAST_COST):
                     break

@@ -66,23 +66,11 @@ SIGNIFICANT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """One object to fit.
+    """One object to fit: what the image shows, what the caller wants, and the constants of residuals and priors.
 
-    Attributes
-    ----------
-    observation
-        What the image shows of the object.
-    options
-        What the caller wants.
-    terms
-        Constants of the residuals and priors.
-    limits
-        Lower and upper limit (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y.
-    deadline
-        ``time.perf_counter`` after which nothing new is tried.
-    independent
-        Number of independent rays that the object counts as, however many are drawn, where errors of neighbouring
-        pixels are alike; None where every ray counts as one.
+    ``limits`` are the lower and the upper one (10,) of a1 a2 a3 e1 e2 t1 t2 t3 k_x k_y.  After ``deadline``, by
+    ``time.perf_counter``, nothing new is tried.  The object counts as so many ``independent`` rays, however many are
+    drawn, where errors of neighbouring pixels are alike; None where every ray counts as one.
     """
 
     observation: Observation
@@ -203,22 +191,10 @@ _OF_A_VALLEY = ("distances", "_with_taper")
 class Solution:
     """A body on its way through the last steps of a fit; what :mod:`sq_perception.fitting.quality` reads in the end.
 
-    Attributes
-    ----------
-    problem
-        The problem of the last stage, with its observation, terms and prior.
-    state, rays
-        The body, and the rays on which its cost is measured.
-    alternatives
-        Other bodies that explain the image almost as well.
-    notes
-        What the body rests on beyond the image, for the message.
-    spread_factor
-        Factor of the covariance, where residuals err alike.
-    as_hull
-        Whether the body resembles the convex hull of the object only.
-    is_unfinished
-        Whether time was up before the search came near the noise, so that the body may be off by any distance.
+    The cost of the body is measured on ``rays``; ``alternatives`` explain the image almost as well.  ``notes`` tell
+    what the body rests on beyond the image, ``spread_factor`` multiplies the covariance where residuals err alike.
+    ``as_hull``: the body resembles the convex hull of the object only.  ``is_unfinished``: time was up before the
+    search came near the noise, so that the body may be off by any distance.
     """
 
     problem: Problem

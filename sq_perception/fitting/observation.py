@@ -30,7 +30,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from sq_perception.fitting.cost import SAMPLE, draw, rays_through
+from sq_perception.fitting.cost import SAMPLE, rays_through
 from sq_perception.fitting.options import ON_SUPPORT
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import MEDIAN_TO_SIGMA
@@ -41,31 +41,17 @@ from sq_perception.imaging.raycast import heights
 
 _STEEPEST = 6.0
 """Largest slope, 80 degrees; steeper pixels count as this, as they determine little of the depth."""
-BAND_PIXELS, _BAND_SHARE = 4, 0.03
+BAND_PIXELS = 4
 """Least width, pixels, of the band around the mask whose every pixel counts, as that much of a mask's edge may be
-missing; and its width as a share of the mask's extent."""
-_WIDER = 0.5
-"""Margins of the crop around the mask, both sides together, as a share of the mask's extent."""
-_HOLE = 5
-"""Width, pixels, up to which holes and notches of the mask are closed: the outline of a convex body has none."""
-_JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
-"""Pixel widths and noise levels whose sum a depth step between neighbours exceeds where a surface ends."""
-_FOOT_PIXELS = 3
-"""Width, pixels, of the part of an object's foot that is no higher than its support."""
+missing."""
 _BEHIND_SHARE = 0.02
 """Share of a mask's pixels joined to the object by way of its support alone, from which on the mask is too large: by
 one pixel around an object of 150.  One in twenty right masks of benchmarks/household_things has as much, from its
 sensor's edges, which changes no mean; with 0.05, clean boxes in masks one pixel too large lost 3 % IoU."""
 _COARSE = 3
 """Spacing, pixels in each direction, of free pixels far from the mask."""
-_FREE_MARGIN = 3.0
-"""Standard deviations in front of the measured depth at which free space ends."""
-_POINTS = 2000
-"""Measured points of an object: enough for its moments, boxes and quantiles to settle."""
 OUTLIER_SHARE = 0.01
 """Share of the points left out at either end of a direction: readings of something else that got into the mask."""
-_SAMPLES = 5000
-"""Third differences that are taken, about: their median is then known to 1.5 %."""
 _FEWEST = 8
 """Fewest differences for an estimate: with fewer, one edge within the mask is the median."""
 
@@ -85,18 +71,9 @@ class DepthNoise(NamedTuple):
 class Crop:
     """An object and its surroundings in an image, as far as they do not depend on how far the object strays.
 
-    Attributes
-    ----------
-    depth, mask : (h, w)
-        NaN where nothing was measured; the caller's mask.  ``camera`` belongs to both.
-    band : int
-        Width, in pixels, of the band around the mask whose every pixel counts.
-    noise : DepthNoise
-        The depth noise.
-    distance : float
-        Mean depth of the object, metres.
-    footprint : float
-        Width of a pixel at that distance, metres.
+    ``depth`` (h, w) is NaN where nothing was measured; ``mask`` is the caller's, ``camera`` belongs to both.  Every
+    pixel counts in a ``band`` of so many pixels around the mask.  ``distance`` is the mean depth of the object,
+    ``footprint`` the width of a pixel there, metres.
     """
 
     depth: np.ndarray
@@ -112,17 +89,18 @@ class Crop:
         """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
         x, y, width, height = regions.box(np.ascontiguousarray(mask))
         extent = max(width, height)
-        band = max(BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
-        margin = max(band, math.ceil(_WIDER * extent / 2))
+        band = max(BAND_PIXELS, math.ceil(0.03 * extent))
+        margin = max(band, math.ceil(extent / 4))
         top, left = max(y - margin, 0), max(x - margin, 0)
         bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)
         crop = np.ascontiguousarray(depth[top:bottom, left:right], dtype=np.float32)
         measured = np.isfinite(crop) & (crop > 0) if camera.is_pinhole else np.isfinite(crop)
         crop = np.where(measured, crop, np.float32(np.nan))
         inside = np.ascontiguousarray(mask[top:bottom, left:right])
-        distance = _mean_depth(crop, inside)
-        if not math.isfinite(distance):
+        readings = crop[inside & np.isfinite(crop)]
+        if not readings.size:
             return None
+        distance = float(readings.mean(dtype=float))
         least = 1e-6 * max(abs(distance), 1e-3)  # what single precision resolves
         known = estimate_noise(crop, inside, least) if noise is None else DepthNoise(noise)
         footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
@@ -132,8 +110,9 @@ class Crop:
     def observe(self, model_error: float, nan_is_empty: bool | None, plane: np.ndarray | None = None) -> Observation:
         """The crop, its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``plane`` as in the options."""
         sigma = math.hypot(self.noise.sigma, model_error)
-        inside = self._coherent(_JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma, plane)
-        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
+        inside = self._coherent(10 * self.footprint + 6 * sigma, plane)
+        # Holes and notches of five pixels are closed: the outline of a convex body has none.
+        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
         claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
         near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
         if nan_is_empty is None:
@@ -143,10 +122,11 @@ class Crop:
             nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < 0.1
         lost = regions.convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
-        shown = draw(pixels, areas, _POINTS, 0.5)
+        reach = np.cumsum(areas, dtype=float)
+        shown = draw(pixels, reach, 2000, 0.5)
         v, u = np.divmod(shown, self.camera.width)
         return Observation(
-            **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, areas=areas, free=free, free_pixels=free_pixels,
+            **{**vars(self), "mask": filled.view(bool)}, pixels=pixels, reach=reach, free=free, free_pixels=free_pixels,
             model_error=model_error, points=np.asfortranarray(self.camera.unproject(u, v, self.depth.ravel()[shown])),
         )
 
@@ -164,7 +144,8 @@ class Crop:
         if not low.any() or 2 * np.count_nonzero(low) > np.count_nonzero(self.mask):
             return inside
         above = coherent(self.depth, self.mask & ~low, jump)
-        with_foot = depth_steps.grow(above.astype(np.int32), low, self.depth, _FOOT_PIXELS, depth_steps.STEP) > 0
+        # Three pixels of an object's foot are no higher than its support.
+        with_foot = depth_steps.grow(above.astype(np.int32), low, self.depth, 3, depth_steps.STEP) > 0
         is_too_large = np.count_nonzero(with_foot) < (1 - _BEHIND_SHARE) * np.count_nonzero(inside)
         return above if is_too_large else inside
 
@@ -173,25 +154,14 @@ class Crop:
 class Observation(Crop):
     """A crop whose pixels are sorted; the mask is that of the object, with its small holes closed.
 
-    Attributes
-    ----------
-    pixels : (n,)
-        All pixels of the object, as indices into the crop in row-major order.
-    areas : (n,)
-        Weights of these pixels for drawing.
-    free : (m,)
-        The pixels beside the object that may constrain it, likewise.
-    free_pixels : int
-        Number of pixels that these stand for.
-    model_error : float
-        How far the object may stray from a superquadric, metres; joins the noise in squares.
-    points : (k, 3)
-        Some 2000 measured points of the object in the optical frame, evenly over its surface; each coordinate a
-        contiguous column, which is reduced several times as fast.
+    ``pixels`` (n,) are those of the object, as indices into the crop in row-major order, ``reach`` (n,) their areas
+    summed up to each; ``free`` (m,) those beside it that may constrain it and stand for ``free_pixels``.  The object
+    may stray from a superquadric by ``model_error``, which joins the noise in squares.  ``points`` (k, 3): some 2000
+    measured ones, evenly over the surface; each coordinate a contiguous column, which is reduced several times as fast.
     """
 
     pixels: np.ndarray
-    areas: np.ndarray
+    reach: np.ndarray
     free: np.ndarray
     free_pixels: int
     model_error: float
@@ -217,7 +187,7 @@ class Observation(Crop):
 
         Draws with other offsets (0 to 1) take other pixels.
         """
-        return self._through(draw(self.pixels, self.areas, count, offset), 0.0)
+        return self._through(draw(self.pixels, self.reach, count, offset), 0.0)
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """At most ``count`` rays (k, 9) of free pixels, drawn evenly; z is where free space ends."""
@@ -227,8 +197,8 @@ class Observation(Crop):
         return self.free_rays_of(pixels)
 
     def free_rays_of(self, pixels: np.ndarray) -> np.ndarray:
-        """The rays through some of the free pixels."""
-        return self._through(pixels, _FREE_MARGIN)
+        """The rays through some of the free pixels; their space ends three standard deviations before the reading."""
+        return self._through(pixels, 3.0)
 
     def ring(self, radius: float) -> np.ndarray:
         """The free pixels at distance ``radius`` from the mask, to half a pixel: at 1, those that touch it."""
@@ -264,17 +234,12 @@ def span(points: np.ndarray, directions: np.ndarray, outliers: float = OUTLIER_S
     return np.asarray(lower + (upper - lower) * (place - before))
 
 
-@kernel
-def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
-    total, count = 0.0, 0
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if inside[v, u] and np.isfinite(depth[v, u]):
-                total += depth[v, u]
-                count += 1
-    if count == 0:
-        return np.nan
-    return total / count
+def draw(pixels: np.ndarray, reach: np.ndarray, count: int, offset: float) -> np.ndarray:
+    """All of the pixels (n,), or about ``count``, systematically by their areas, summed up to each in ``reach``."""
+    if len(pixels) <= count:
+        return pixels
+    chosen = np.searchsorted(reach, (np.arange(count) + offset) * (reach[-1] / count), side="right")
+    return pixels[chosen[np.diff(chosen, prepend=-1) > 0]]  # each once
 
 
 @kernel
@@ -328,50 +293,28 @@ def _write_areas(depth: np.ndarray, inside: np.ndarray, v: int, footprint: float
 
 def estimate_noise(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
     """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be estimated."""
-    spread, quantum = _noise(depth, inside)
-    is_rounded = spread < 0.5 * quantum
-    return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum if is_rounded else 0.0)
-
-
-@kernel
-def _noise(depth: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
-    """The standard deviation by third differences, and the quantum of the first ones; 0 for what is not known."""
-    third, first = _differences(depth, inside, max(1, int(2 * np.count_nonzero(inside) / _SAMPLES)))
+    step = max(1, np.count_nonzero(inside) // 2500)  # the median of 5000 third differences is known to 1.5 %
+    third, first = np.hstack([_differences(depth, inside, step), _differences(depth.T, inside.T, step)])
     if third.size < _FEWEST:
-        return 0.0, 0.0
+        return DepthNoise(least)
     median = np.partition(third, third.size // 2)[third.size // 2]
     moved = first[first > 0]
     if moved.size >= _FEWEST:
         rank = moved.size // 50
-        quantum = np.partition(moved, rank)[rank]
+        quantum = float(np.partition(moved, rank)[rank])
         steps = moved / quantum
-        if np.count_nonzero(np.abs(steps - np.rint(steps)) < 0.02) > 0.8 * moved.size:
+        if np.mean(np.abs(steps - np.rint(steps)) < 0.02) > 0.8:
             # The median of whole steps is a whole step; beyond six of either is an edge.
             near = third[third < 6.0 * max(median, quantum)]
-            return math.sqrt(np.mean(near * near) / 20.0), quantum
-    return MEDIAN_TO_SIGMA * median / math.sqrt(20.0), 0.0
+            spread = math.sqrt(np.mean(near * near) / 20.0)
+            is_rounded = spread < 0.5 * quantum
+            return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum if is_rounded else 0.0)
+    return DepthNoise(max(MEDIAN_TO_SIGMA * float(median) / math.sqrt(20.0), least))
 
 
-@kernel
-def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Absolute third and first differences along rows and columns, every ``step``-th line."""
-    height, width = depth.shape
-    most = ((height - 1) // step + 1) * width + ((width - 1) // step + 1) * height
-    third, first = np.empty(most), np.empty(most)
-    count = 0
-    for down, right in ((0, 1), (1, 0)):
-        for v in range(0, height - 3 * down, 1 if down else step):
-            for u in range(0, width - 3 * right, 1 if right else step):
-                line = True
-                for k in range(4):
-                    line = line and inside[v + k * down, u + k * right]
-                if not line:
-                    continue
-                a, b = depth[v, u], depth[v + down, u + right]
-                c, d = depth[v + 2 * down, u + 2 * right], depth[v + 3 * down, u + 3 * right]
-                value = abs(a - 3.0 * b + 3.0 * c - d)
-                if value >= 0.0:
-                    third[count] = value
-                    first[count] = abs(np.float64(a) - np.float64(b))
-                    count += 1
-    return third[:count], first[:count]
+def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> np.ndarray:
+    """Absolute third and first differences (2, n) along every ``step``-th row."""
+    rows, within = depth[::step].astype(float), inside[::step]
+    third, first = np.abs(np.diff(rows, 3)), np.abs(np.diff(rows))[:, : max(rows.shape[1] - 3, 0)]
+    known = within[:, :-3] & within[:, 1:-2] & within[:, 2:-1] & within[:, 3:] & (third >= 0)
+    return np.stack([third[known], first[known]])

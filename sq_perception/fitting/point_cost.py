@@ -74,17 +74,8 @@ class Cloud(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class UnitCloud:
-    """A cloud in its own frame: p = centre + scale axes q.
-
-    Attributes
-    ----------
-    points : (n, 3)
-        q, neighbours one after the other.
-    normals : (n, 3) or None
-        Outward, in the same frame.
-    centre, axes, scale
-        The cloud's frame: (3,) metres, a rotation (3, 3), metres.
-    """
+    """A cloud in its own frame, p = centre + scale axes q: q (n, 3), neighbours one after the other, and outward
+    normals (n, 3), if any."""
 
     points: np.ndarray
     normals: np.ndarray | None

@@ -47,10 +47,6 @@ _MOST_TAPER = 0.9
 """Largest taper of a body to points: those from all sides show a cone."""
 _PRIOR = np.array([1.0] * 3 + [0.5] * 2 + [1.0] * 3 + [1.0] * 3 + [0.5] * 2) ** -2.0
 """Precision of the prior of a step: what points leave open has its width."""
-_OF_MESH = 20000
-"""Points that are drawn from a mesh."""
-_NEIGHBOURS = 9
-"""Points in a neighbourhood, its middle included, that tell how dense a cloud is there."""
 _ONE_SIDED = 0.75
 """Share of 42 directions from the centre in which there must be points of an object that is seen from all sides."""
 
@@ -135,7 +131,7 @@ def surface_of(thing: Any, normals: np.ndarray | None = None) -> tuple[np.ndarra
         mesh = trimesh.Trimesh(vertices, faces, process=False)
         if not (np.isfinite(mesh.area) and mesh.area > 0):
             raise ValueError("mesh: expected faces with an area, of finite vertices")
-        drawn, face = trimesh.sample.sample_surface(mesh, _OF_MESH, seed=0)
+        drawn, face = trimesh.sample.sample_surface(mesh, 20_000, seed=0)
         return np.asarray(drawn), mesh.face_normals[face]
     kept, there = finite_points(thing)
     if normals is None:
@@ -190,7 +186,7 @@ def _starts(cloud: UnitCloud) -> list[State]:
     from scipy.spatial import cKDTree  # here: a node that recovers does without
 
     few = cloud.surface(500).points
-    reach = cKDTree(few).query(few, k=min(_NEIGHBOURS, len(few)))[0][:, -1]
+    reach = cKDTree(few).query(few, k=min(9, len(few)))[0][:, -1]  # itself and eight neighbours
     # Of a cloud with 60 % of outliers seven in eight of the densest 30 % are none.
     dense = few[np.argsort(reach, kind="stable")[: max(3, round(0.3 * len(few)))]]
     found = []

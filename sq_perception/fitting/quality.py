@@ -44,11 +44,6 @@ WEAK_SHARE = 0.15
 """Standard deviation of a half size, as a share of it, above which it is called undetermined."""
 _PRIOR = np.array([1.0, 1.0, 1.0, 0.5, 0.5, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 """Standard deviations of the prior: a factor e, half of the range of an exponent, one size, a radian."""
-_NEAR_AXIS = 16
-"""Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
-degrees apart."""
-_REACHED = 0.9
-"""Share of the points of a thing fitted as a hull: how far the rest sticks out decides whether it is enclosed."""
 _UNFINISHED = "how far it is off is not known"
 _AXES = "xyz"
 
@@ -97,10 +92,6 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     Where an image is some 10^8 times as precise in one direction as the prior is in another, rounding hides the small
     eigenvalues, and an inverse may have variances below 0 or far above the prior's: the eigenvalues are then held.
     """
-    inverse = np.linalg.inv(information)
-    variances = np.diag(inverse)
-    if (variances > 0.0).all() and (variances < 2.0 / least).all():
-        return inverse
     values, axes = np.linalg.eigh(information)
     return (axes / np.maximum(values, least)) @ axes.T
 
@@ -113,7 +104,7 @@ def _add_distances(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, c
     errs by the differences in the directions near to it: whether both ends do so alike or apart, neither half their
     sum, the size, nor half their difference, the centre, errs by more.
     """
-    near = (terms.hull_directions @ rotation) ** _NEAR_AXIS
+    near = (terms.hull_directions @ rotation) ** 16  # half at 17 degrees, as neighbours are 32 degrees apart
     off = hull_distances(terms, parameters, rotation)
     square = (off * off) @ near / near.sum(axis=0)
     for k in range(3):
@@ -180,8 +171,8 @@ def assess(solution: Solution, began: float) -> Fit:
     typical = quantile(np.abs(solution.distances), 0.5)
     residual, inlier_share = _within(solution.distances, INLIER * observation.sigma, INLIER * typical)
     if solution.as_hull:
-        # A hollow thing lies inside its hull: only what sticks out speaks against the body.
-        typical = quantile(np.maximum(solution.distances, 0.0), _REACHED)
+        # A hollow thing lies inside its hull: only what sticks out speaks against the body, if a tenth does.
+        typical = quantile(np.maximum(solution.distances, 0.0), 0.9)
     reached, message = judge(canonical, covariance, typical, observation.sigma, solution.as_hull)
     if solution.is_unfinished and reached == Status.CONVERGED:
         reached, message = Status.WEAK, _UNFINISHED

@@ -35,8 +35,6 @@ from sq_perception.fitting.residuals import CLASSIC
 from sq_perception.fitting.starts import principal_axes, reason_to_fail, three_orders
 from sq_perception.geometry import rotation as quaternions
 
-_MOST_POINTS = 1000
-"""Most points that are fitted.  Chosen: the cost of the method grows with their number, its result hardly changes."""
 _ESCAPE = 0.3
 """Standard deviation of a disturbance: of log sizes, exponents, angles, and of the centre in mean half sizes."""
 
@@ -66,8 +64,8 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
     """
     began = time.perf_counter()
     points, _ = finite_points(points)
-    if len(points) > _MOST_POINTS:
-        points = points[np.linspace(0, len(points) - 1, _MOST_POINTS).astype(int)]
+    if len(points) > 1000:  # the cost of the method grows with their number, its result hardly changes
+        points = points[np.linspace(0, len(points) - 1, 1000).astype(int)]
     reason = reason_to_fail(points, len(points), "points")
     state = moment_start(points)
     if not reason:

@@ -33,10 +33,7 @@ from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation, span
 from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Lens
-from sq_perception.imaging.raycast import point_at
 
 _BOX_EXPONENT = 0.3
 """Exponents of a start from a box, nearer to a box than to an ellipsoid; a few steps find the rest."""
@@ -45,8 +42,6 @@ START_EXPONENT = 0.5
 """Moment over squared half size, and exponents, of a start: between ellipsoid (0.2, 1) and box (1/3, 0)."""
 EIGHTH_TURNS = quaternions.to_matrix(quaternions.from_rotation_vector(np.eye(3) * math.pi / 4))
 """Rotations (3, 3, 3) by 45 degrees about each axis."""
-_EXPONENTS = (0.3, 0.8)
-"""Exponents of the last group: between box and ellipsoid, nearer to either."""
 ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
 """Which of three right-handed axes are x, y and z, so that each is z once."""
 
@@ -125,89 +120,39 @@ def boxes(low: np.ndarray, high: np.ndarray, axes: np.ndarray, exponent: float =
 
 
 def groups(observation: Observation) -> Iterator[list[State]]:
-    """Groups of starts in the order in which to try them, the last one of everything at once, boxes too; boxes of the
-    points alone where nothing shows the symmetry."""
-    completed = completed_moments(observation)
-    if completed is None:
-        yield principal(observation.points)
-        return
-    axes = principal_axes(completed[1])
-    turned = [axes, *eighth_turns(axes)]
-    yield from (states(*completed, each) for each in turned)
-    boxes = principal(observation.points)
-    yield boxes + [state for e in _EXPONENTS for each in turned for state in states(*completed, each, e)]
+    """Groups of starts in the order in which to try them: bodies completed by symmetry, if anything shows it, and boxes
+    of the points."""
+    if (completed := completed_moments(observation)) is not None:
+        axes = principal_axes(completed[1])
+        yield from (states(*completed, each) for each in (axes, *eighth_turns(axes)))
+    yield principal(observation.points)
 
 
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
     """Centre (3,) and second moments (3, 3) about it of the completed body; None if no pixel has an opposite."""
-    camera = observation.camera
+    camera, depth = observation.camera, observation.depth
+    silhouette = cv2.moments(observation.mask.view(np.uint8), binaryImage=True)
+    middle = np.array([silhouette["m10"], silhouette["m01"]]) / silhouette["m00"]
     # Some 2500 pairs give second moments to 2 %.
     stride = max(1, round(math.sqrt(len(observation.pixels) / 2500)))
-    u, v, pairs = _opposite_pairs(observation.depth, observation.mask, camera.lens, stride)
-    if len(pairs) < 3:
+    seen = observation.mask & np.isfinite(depth)
+    v, u = stride * np.array(np.nonzero(seen[::stride, ::stride]))
+    opposite_u, opposite_v = np.floor(2 * middle[:, None] - (u, v) + 0.5).astype(int)
+    within = (opposite_u >= 0) & (opposite_v >= 0) & (opposite_u < camera.width) & (opposite_v < camera.height)
+    has_opposite = within & seen[opposite_v * within, opposite_u * within]
+    if np.count_nonzero(has_opposite) < 3:
         return None
+    u, v, opposite_u, opposite_v = (each[has_opposite] for each in (u, v, opposite_u, opposite_v))
+    points = camera.unproject(u, v, depth[v, u])
+    opposite = camera.unproject(opposite_u, opposite_v, depth[opposite_v, opposite_u])
+    across, between = (points - opposite) / 2, (points + opposite) / 2
     # The centre's depth is the largest mean depth of a pair, but for some in case of stray pixels.
-    rank = len(pairs) - 1 - min(max(4 // stride**2, int(0.002 * len(pairs))), len(pairs) - 1)
-    depth = float(np.partition(pairs[:, 5], rank)[rank])
-    centre = camera.unproject(np.array(u), np.array(v), np.array(depth))
-    return centre, _moments(pairs, centre, observation.footprint / 2)
-
-
-@kernel
-def _moments(pairs: np.ndarray, centre: np.ndarray, shortest: float) -> np.ndarray:
-    """Second moments (3, 3) sum |h| (m m^T + h h^T / 3) / sum |h| over pairs of m and C - h."""
-    moments = np.zeros((3, 3))
-    total = 0.0
-    for i in range(pairs.shape[0]):
-        weight = max(centre[2] - pairs[i, 5], shortest)
-        total += weight
-        for j in range(3):
-            chord = centre[j] - pairs[i, 3 + j]
-            for k in range(j + 1):
-                moments[j, k] += weight * (pairs[i, j] * pairs[i, k] + chord * (centre[k] - pairs[i, 3 + k]) / 3.0)
-    for j in range(3):
-        for k in range(j + 1):
-            moments[j, k] /= total
-            moments[k, j] = moments[j, k]
-    return moments
-
-
-@kernel
-def _opposite_pairs(
-    depth: np.ndarray, inside: np.ndarray, lens: Lens, stride: int,
-) -> tuple[float, float, np.ndarray]:
-    """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points.
-
-    Only pixels of every ``stride``-th row and column are looked at.
-    """
-    height, width = depth.shape
-    total_u, total_v, count = 0.0, 0.0, 0
-    for v in range(height):
-        in_row = 0
-        for u in range(width):
-            if inside[v, u]:
-                total_u += u
-                in_row += 1
-        total_v += v * in_row
-        count += in_row
-    centre_u, centre_v = total_u / count, total_v / count
-    pairs = np.empty((((height - 1) // stride + 1) * ((width - 1) // stride + 1), 6))
-    k = 0
-    for v in range(0, height, stride):
-        for u in range(0, width, stride):
-            if not inside[v, u] or not np.isfinite(depth[v, u]):
-                continue
-            u2, v2 = int(np.floor(2.0 * centre_u - u + 0.5)), int(np.floor(2.0 * centre_v - v + 0.5))
-            if u2 < 0 or v2 < 0 or u2 >= width or v2 >= height:
-                continue
-            if not inside[v2, u2] or not np.isfinite(depth[v2, u2]):
-                continue
-            x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
-            x2, y2, z2 = point_at(u2, v2, np.float64(depth[v2, u2]), lens)
-            pairs[k, 0], pairs[k, 1], pairs[k, 2] = 0.5 * (x - x2), 0.5 * (y - y2), 0.5 * (z - z2)
-            pairs[k, 3], pairs[k, 4], pairs[k, 5] = 0.5 * (x + x2), 0.5 * (y + y2), 0.5 * (z + z2)
-            k += 1
-    return centre_u, centre_v, pairs[:k]
+    rank = len(between) - 1 - min(max(4 // stride**2, int(0.002 * len(between))), len(between) - 1)
+    centre = camera.unproject(*middle, np.partition(between[:, 2], rank)[rank])
+    chord = centre - between
+    weight = np.maximum(chord[:, 2:], observation.footprint / 2)
+    moments = ((weight * across).T @ across + (weight * chord).T @ chord / 3) / weight.sum()
+    return centre, moments
 
 
 def eighth_turns(axes: np.ndarray) -> np.ndarray:
@@ -215,13 +160,14 @@ def eighth_turns(axes: np.ndarray) -> np.ndarray:
     return np.asarray(axes @ EIGHTH_TURNS)
 
 
-def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = START_EXPONENT) -> list[State]:
+def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray) -> list[State]:
     """The three bodies with these axes and moments, one for each choice of z."""
     found = []
     for rotation in three_orders(axes):
         spread = np.einsum("ji,jk,ki->i", rotation, moments, rotation)
         size = np.sqrt(np.maximum(spread, 1e-12) / MOMENT_SHARE)
-        found.append(State(np.concatenate([size, [exponent, exponent], centre, [0.0, 0.0]]), rotation, math.inf, 0))
+        parameters = np.concatenate([size, [START_EXPONENT] * 2, centre, [0.0, 0.0]])
+        found.append(State(parameters, rotation, math.inf, 0))
     return found
 
 

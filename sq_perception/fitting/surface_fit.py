@@ -90,8 +90,6 @@ SPREAD = 2.5**2
 _FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
 """Object rays of the last stage, and most of them under much noise: a depth error of a third of a pixel's width
 averages out to a two hundredth.  Chosen on benchmarks/single_body."""
-_SHRUNK = 0.25
-"""Depth, in pixels: a body that covers half of the free pixels beside the mask this deep is larger than its mask."""
 _UNFINISHED = 1.06
 """Mean squared residual up to which a search that the time budget ended has come near the noise: bodies above it
 typically err by 5 to 40 standard deviations."""
@@ -134,16 +132,16 @@ def fit(
     """
     began = time.perf_counter()
     options = options or FitOptions()
-    depth, mask = _check_images(depth, mask, camera)
+    depth, mask = camera.readings(depth), np.asarray(mask)
+    if mask.shape != depth.shape or mask.dtype != bool:
+        raise ValueError(f"mask: expected a bool image of shape {depth.shape}, got {mask.dtype} {mask.shape}")
     later = cache(lambda: _read_starts(start())) if callable(start) else None
     given = [] if callable(start) else _read_starts(start)
     crop = Crop.around(depth, mask, camera, options.noise)
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
-    fills_image = fills(box(mask), np.isfinite(depth) & (depth > 0))
-    task = _Task(crop, fills_image, options, given, later, began)
-    solution = _solve(task)
-    if solution is None:
+    task = _Task(crop, fills(box(mask), np.isfinite(depth) & (depth > 0)), options, given, later, began)
+    if (solution := _solve(task)) is None:
         observation = crop.observe(options.model_error or 0.0, options.nan_is_empty, options.plane)
         return fail(observation.points, observation.footprint, observation.sigma, _why_not(observation), began)
     return assess(solution, began)
@@ -151,8 +149,8 @@ def fit(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """An object to fit: the image near it, and whether it is all that was measured, as the unit cube's bodies and walls
-    before a camera are; the caller's starts, ``later`` those that cost time; when the fit began."""
+    """An object to fit: the image near it, and whether it fills that, as the unit cube's bodies and walls before a
+    camera do; the caller's starts, ``later`` those that cost time; when the fit began."""
 
     crop: Crop
     fills_image: bool
@@ -230,8 +228,8 @@ def _fit_thing(task: _Task, model_error: float, starts_: list[State]) -> Solutio
         problem = replace(problem, independent=(problem.independent or 0.0) / misfit)
         found = found if problem.late else problem.search(found, THING[1:])
     rays = problem.draw(task.options.pixels or SAMPLE, 0.3)
-    spread = 1.0 if problem.has_hull else SPREAD
-    solution = Solution(problem, problem.descend(found[0], rays, 30), rays, spread_factor=spread)
+    state = problem.descend(found[0], rays, 30)
+    solution = Solution(problem, state, rays, spread_factor=1.0 if problem.has_hull else SPREAD)
     if problem.has_hull and not problem.late:
         solution = _straighten(solution)
     left = _mean_loss(problem, solution.state)
@@ -309,13 +307,13 @@ def _finish(problem: Problem, finalists: Sequence[State]) -> Solution:
     return Solution(problem, refined[0], rays)
 
 
-def _is_explained(solution: Solution, noise: float) -> bool:
-    """Return whether a thing's body leaves less than the noise, so that a superquadric may explain the image."""
-    return deviation(np.abs(solution.distances)) < noise
+def _is_explained(thing: Solution, noise: float) -> bool:
+    """Whether a thing's body leaves less than the noise, so that a superquadric may explain the image."""
+    return deviation(np.abs(thing.distances)) < noise
 
 
 def warm_up() -> None:
-    """Compile, or load from disk, every kernel of the fit by running it once on a small synthetic scene."""
+    """Compile, or load from disk, every kernel of the fit."""
     body = Superquadric([0.05, 0.04, 0.03], [0.5, 0.5], [0.0, 0.0, 0.5], [0.3, 0.2, 0.1, 0.9])
     plane = np.array([0.0, 0.0, -1.0, 0.7])
     reach = DIRECTIONS @ body.translation + body.support(DIRECTIONS)
@@ -337,11 +335,11 @@ def warm_up() -> None:
 def drop_lost_edge(problem: Problem, state: State) -> tuple[Problem, State]:
     """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
     full = problem.observation
-    if _depth_inside(problem, state, full.ring(1)) < _SHRUNK:
+    if not _covers(problem, state, full.ring(1)):
         return problem, state
     problem = replace(problem, observation=full.beyond(BAND_PIXELS))
     state = problem.descend(state, problem.draw(_FINAL_RAYS, 0.6), tolerance=FINAL_TOLERANCE)
-    rings = (k for k in range(1, BAND_PIXELS + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
+    rings = (k for k in range(1, BAND_PIXELS + 1) if not _covers(problem, state, full.ring(k)))
     band = next(rings, BAND_PIXELS + 1) - 1
     return replace(problem, observation=full.beyond(band) if band > 0 else full), state
 
@@ -361,37 +359,25 @@ def sharpen_outline(problem: Problem, state: State, free: np.ndarray, rays: Rays
         before, sigma = sigma, _outline_sigma(problem, state, free)
 
 
-def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
-    """Depth, in pixels, to which the body covers half of these free pixels.
+def _covers(problem: Problem, state: State, pixels: np.ndarray) -> bool:
+    """Whether the body covers half of these free pixels a quarter of a pixel deep, and so is larger than its mask.
 
     Half: a body that is merely too long covers those around the mask on one side only.
     """
     rays = problem.observation.free_rays_of(pixels)
-    if len(rays) == 0:
-        return 0.0
     depth = penetration(rays, problem.terms, state.parameters, state.rotation)
-    return quantile(depth, 0.5) / problem.observation.footprint
+    return len(rays) > 0 and quantile(depth, 0.5) >= 0.25 * problem.observation.footprint
 
 
 def _outline_sigma(problem: Problem, state: State, free: np.ndarray) -> float:
     """Standard deviation of the outline, metres, from how far the body reaches into free rays beside the mask."""
     # A perfect one covers exactly the centres of the mask's pixels: a uniform error of up to half a pixel.
-    sharp = problem.observation.footprint / math.sqrt(12)
+    sharp = 0.3 * problem.observation.footprint
     if len(free) == 0:
         return sharp
     depth = penetration(free, problem.terms, state.parameters, state.rotation)
     reached = depth[depth > 0]
     return max(sharp, float(np.sqrt(np.mean(reached**2)))) if len(reached) else sharp
-
-
-# Arguments
-
-
-def _check_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    depth, mask = camera.readings(depth), np.asarray(mask)
-    if mask.shape != depth.shape or mask.dtype != bool:
-        raise ValueError(f"mask: expected a bool image of shape {depth.shape}, got {mask.dtype} {mask.shape}")
-    return depth, mask
 
 
 def _read_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadric]) -> list[State]:

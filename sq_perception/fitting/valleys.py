@@ -105,13 +105,29 @@ def explore(solution: Solution) -> Solution:
 
 
 def weigh_depths(solution: Solution) -> Solution:
-    """The solution with all half sizes along the view that the image allows, where readings are rounded."""
-    quantum = solution.problem.observation.noise.quantum
+    """The solution with all half sizes along the view that the image allows, where readings are rounded.
+
+    The body stays, as it averages roundings out, unless the readings leave a size open: then it is the mean of all.
+    """
+    observation, best = solution.problem.observation, solution.state
+    quantum = observation.noise.quantum
     if not (quantum > 0 and faces_camera(solution.rays.hits, quantum)):
         return solution
-    best, allowed = plausible_depths(solution)
-    solution = replace(solution, state=best)
-    return solution.annotate(alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2) if allowed else solution
+    rays = solution.rays.every(max(1, len(solution.rays.hits) // SAMPLE))
+    problem = solution.problem.with_terms(dead_zone=_DEAD_ZONE * quantum / observation.sigma)
+    walk = _walk(problem, rays, best, math.inf)
+    if _weigh(walk)[1] < _CERTAIN:
+        return solution
+    own = next(each.state for each in walk if each.log_size == math.log(best.parameters[_view_axis(best)]))
+    for rival in starts.other_orders(best):
+        walk += _walk(problem, rays, rival, min(each.state.cost for each in walk))
+    mean, deviation, weights = _weigh(walk)
+    others = tuple(Alternative(each.state, float(weight)) for each, weight in zip(walk, weights, strict=True))
+    least = min(each.state.cost for each in walk)
+    if deviation > _OPEN or own.cost > least + _ALLOWED:
+        likely = (each for each in walk if each.state.cost < least + _ALLOWED)
+        best = _hold(problem, rays, min(likely, key=lambda each: abs(each.log_size - mean)).state, mean)
+    return replace(solution, state=best).annotate(alternatives=others, spread_factor=_FACE_SPREAD**2)
 
 
 def weigh_open_sizes(solution: Solution) -> Solution:
@@ -162,29 +178,6 @@ def faces_camera(hits: np.ndarray, quantum: float) -> bool:
 def _view_axis(state: State) -> int:
     """The axis of the body that is nearest to the camera's."""
     return int(np.argmax(np.abs(state.rotation[2])))
-
-
-def plausible_depths(solution: Solution) -> tuple[State, list[Alternative]]:
-    """The best body, and those that the rounded readings allow, none if no other than the given one.
-
-    The best is the given one, which averages roundings out, as long as the readings hardly leave a size open, else the
-    mean of all.
-    """
-    best, observation = solution.state, solution.problem.observation
-    rays = solution.rays.every(max(1, len(solution.rays.hits) // SAMPLE))
-    problem = solution.problem.with_terms(dead_zone=_DEAD_ZONE * observation.noise.quantum / observation.sigma)
-    walk = _walk(problem, rays, best, math.inf)
-    if min(each.state.cost for each in walk) < _ALLOWED and _weigh(walk)[1] < _CERTAIN:
-        return best, []
-    start = next(each.state for each in walk if each.log_size == math.log(best.parameters[_view_axis(best)]))
-    for rival in starts.other_orders(best):
-        walk += _walk(problem, rays, rival, min(each.state.cost for each in walk))
-    mean, deviation, weights = _weigh(walk)
-    others = [Alternative(each.state, float(weight)) for each, weight in zip(walk, weights, strict=True)]
-    if deviation < _OPEN and start.cost < min(each.state.cost for each in walk) + _ALLOWED:
-        return best, others
-    near = sorted(walk, key=lambda each: abs(each.log_size - mean))[:3]
-    return _hold(problem, rays, min(near, key=lambda each: each.state.cost).state, mean), others
 
 
 class _Held(NamedTuple):
