@@ -104,11 +104,7 @@ class Outputs:
         self.results.append(entry)
         stem = output_file.free_name(_stem(entry), self._stems)
         if options.pictures:
-            from sq_perception.evaluation.plots import save
-            from sq_perception.evaluation.recovery_figure import recovery_figure
-
-            title = console.replace_unprintable(frame.name)
-            save(recovery_figure(frame.depth, frame.camera, recovery, title), options.pictures / f"{stem}.png")
+            _draw(options.pictures / f"{stem}.png", frame, recovery)
         if options.meshes:
             _write_mesh(options.meshes / f"{stem}.{options.mesh_format}", frame, recovery)
         if options.export:
@@ -181,6 +177,14 @@ def _bag(options: argparse.Namespace) -> ResultBag | None:
         return ResultBag(options.mcap, [] if images == ["none"] else images)
     except (ValueError, ImportError) as error:
         raise type(error)(f"--mcap: {error}") from error
+
+
+def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+    """Draw the picture of a frame."""
+    from sq_perception.evaluation.plots import save
+    from sq_perception.evaluation.recovery_figure import recovery_figure
+
+    save(recovery_figure(frame.depth, frame.camera, recovery, console.replace_unprintable(frame.name)), path)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

@@ -239,7 +239,7 @@ def draw(pixels: np.ndarray, reach: np.ndarray, count: int, offset: float) -> np
     if len(pixels) <= count:
         return pixels
     chosen = np.searchsorted(reach, (np.arange(count) + offset) * (reach[-1] / count), side="right")
-    return pixels[chosen[np.flatnonzero(np.diff(chosen, append=len(pixels)))]]
+    return pixels[chosen[np.diff(chosen, append=len(pixels)) > 0]]  # each once
 
 
 @kernel

@@ -149,6 +149,15 @@ def test_a_moved_body_is_the_same_in_another_place(rng):
     assert np.abs(error_of(tracks[0], truth)[0][:3]).max() < 0.04
 
 
+def test_a_body_set_down_at_once_does_not_run_on(rng):
+    """20 cm in a quarter of a second, then at rest: no velocity is made up, no id lost."""
+    tracker = Tracker()
+    for k in range(10):
+        tracks = tracker.update([draw(body(centre=(0.2 * (k > 5), 0, 0.8)), noise(), rng)], 0.25 * k)
+        assert [t.id for t in tracks] == [1]
+        assert not tracks[0].velocity.any()
+
+
 def test_a_hidden_body_does_not_lend_its_id_to_its_like(rng):
     """Two cans of a kind: one is hidden, then a third comes into view at some distance."""
     hidden, wall = body(), body((0.2, 0.2, 0.01), (0.1, 0.1), (0, 0, 0.5), (0, 0, 0))
