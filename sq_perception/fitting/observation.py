@@ -97,10 +97,10 @@ class Crop:
         measured = np.isfinite(crop) & (crop > 0) if camera.is_pinhole else np.isfinite(crop)
         crop = np.where(measured, crop, np.float32(np.nan))
         inside = np.ascontiguousarray(mask[top:bottom, left:right])
-        readings = crop[inside & np.isfinite(crop)]
-        if not readings.size:
+        seen = (inside & measured).view(np.uint8)
+        if not seen.any():
             return None
-        distance = float(readings.mean(dtype=float))
+        distance = float(cv2.mean(crop, seen)[0])
         least = 1e-6 * max(abs(distance), 1e-3)  # what single precision resolves
         known = estimate_noise(crop, inside, least) if noise is None else DepthNoise(noise)
         footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
@@ -239,7 +239,7 @@ def draw(pixels: np.ndarray, reach: np.ndarray, count: int, offset: float) -> np
     if len(pixels) <= count:
         return pixels
     chosen = np.searchsorted(reach, (np.arange(count) + offset) * (reach[-1] / count), side="right")
-    return pixels[chosen[np.diff(chosen, prepend=-1) > 0]]  # each once
+    return pixels[chosen[np.diff(chosen, append=len(pixels)) > 0]]  # each once
 
 
 @kernel

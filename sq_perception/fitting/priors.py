@@ -79,64 +79,70 @@ class HullPrior:
 @kernel
 def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """Cost of all terms together."""
-    logs = np.log(parameters[:3])
-    cost = terms.volume_price * logs.sum()
+    rows = np.zeros((STEP_LENGTH + 1, 13))  # of all terms but the hull; residuals in the last row
+    log_a1, log_a2, log_a3 = math.log(parameters[0]), math.log(parameters[1]), math.log(parameters[2])
+    cost = terms.volume_price * (log_a1 + log_a2 + log_a3)
     sums[STEP_LENGTH, :3] += 0.5 * terms.volume_price
     if terms.plane_stiffness > 0.0:
         down = np.empty((1, 3))
         down[0] = -terms.plane[:3]
-        rows = _support_rows(down, terms.plane[3:], parameters, rotation)
+        rows[:, :1] = _support_rows(down, terms.plane[3:], parameters, rotation)
         is_below = rows[STEP_LENGTH, 0] > 0.0
-        cost += _add(rows * (terms.plane_stiffness if is_below else terms.gap_stiffness), not is_below, sums)
+        cost += _weigh(rows, 0, 1, terms.plane_stiffness if is_below else terms.gap_stiffness, 0.0 if is_below else 1.0)
     if terms.rest_stiffness > 0.0:
-        rows, n = np.zeros((STEP_LENGTH + 1, 2)), terms.plane[:3] @ rotation
-        for j in range(2):
-            k = (np.argmax(np.abs(n)) + 1 + j) % 3
-            after, before = (k + 1) % 3, (k + 2) % 3
+        n = terms.plane[:3] @ rotation
+        upright = np.argmax(np.abs(n))
+        for j in range(1, 3):
+            k, after, before = (upright + j) % 3, (upright + j + 1) % 3, (upright + j + 2) % 3
             rows[8 + before, j], rows[8 + after, j], rows[STEP_LENGTH, j] = n[after], -n[before], n[k]
-        cost += _add(rows * terms.rest_stiffness, True, sums)
+        cost += _weigh(rows, 1, 3, terms.rest_stiffness, 1.0)
     if terms.proportion_stiffness > 0.0:
-        rows = np.zeros((STEP_LENGTH + 1, 3))
-        rows[:3], rows[STEP_LENGTH] = np.eye(3) - 1.0 / 3.0, logs - logs.mean()
-        cost += _add(rows * terms.proportion_stiffness, False, sums)
+        mean = (log_a1 + log_a2 + log_a3) / 3.0
+        for k in range(3):
+            rows[:3, 3 + k] = -1.0 / 3.0
+            rows[k, 3 + k] += 1.0
+        rows[STEP_LENGTH, 3], rows[STEP_LENGTH, 4], rows[STEP_LENGTH, 5] = log_a1 - mean, log_a2 - mean, log_a3 - mean
+        cost += _weigh(rows, 3, 6, terms.proportion_stiffness, 0.0)
     if terms.expectation_stiffness > 0.0:
         for k in range(3):
-            rows = np.zeros((STEP_LENGTH + 1, 1))
-            rows[k], rows[STEP_LENGTH] = 1.0, logs[k] - math.log(terms.expected[k])
-            cost += _add(rows * terms.expectation_stiffness, True, sums)
+            rows[k, 6 + k], rows[STEP_LENGTH, 6 + k] = 1.0, math.log(parameters[k] / terms.expected[k])
+            cost += _weigh(rows, 6 + k, 7 + k, terms.expectation_stiffness, 1.0)
     if terms.roundness_stiffness > 0.0:
-        rows = np.zeros((STEP_LENGTH + 1, 2))
-        rows[0, 0], rows[1, 0], rows[STEP_LENGTH, 0] = 1.0, -1.0, logs[0] - logs[1]
-        rows[4, 1], rows[STEP_LENGTH, 1] = -1.0, 1.0 - parameters[4]
-        cost += _add(rows * terms.roundness_stiffness, True, sums, 3.0)
+        rows[0, 9], rows[1, 9], rows[STEP_LENGTH, 9] = 1.0, -1.0, log_a1 - log_a2
+        rows[4, 10], rows[STEP_LENGTH, 10] = -1.0, 1.0 - parameters[4]
+        cost += _weigh(rows, 9, 11, terms.roundness_stiffness, 3.0)
     if terms.taper_stiffness > 0.0:
-        rows = np.zeros((STEP_LENGTH + 1, 2))
-        rows[11, 0], rows[12, 1], rows[STEP_LENGTH] = 1.0, 1.0, parameters[8:]
-        cost += _add(rows * terms.taper_stiffness, False, sums)
+        rows[11, 11], rows[12, 12], rows[STEP_LENGTH, 11:] = 1.0, 1.0, parameters[8:]
+        cost += _weigh(rows, 11, 13, terms.taper_stiffness, 0.0)
+    add_block(rows, rows.shape[1], sums)
     if terms.hull_directions.shape[0] > 0:
         cost += hull_cost(terms, parameters, rotation, sums)
     return cost
 
 
 @kernel
-def _add(rows: np.ndarray, has_tails: bool, sums: np.ndarray, factor: float = 1.0) -> float:
-    """The cost of residuals, the last row, below their derivatives: their squares, or Cauchy's loss of them together,
-    times a factor."""
+def _weigh(rows: np.ndarray, begin: int, end: int, stiffness: float, tails: float) -> float:
+    """The cost of the residuals of some columns, which become so stiff: their squares, or, if ``tails`` is not 0, so
+    many times Cauchy's loss of them together."""
     square = 0.0
-    for residual in rows[STEP_LENGTH]:
-        square += residual * residual
-    if has_tails:
-        rows *= math.sqrt(factor / (1.0 + square))
-        square = factor * math.log1p(square)
-    add_block(rows, rows.shape[1], sums)
-    return square
+    for j in range(begin, end):
+        square += (stiffness * rows[STEP_LENGTH, j]) ** 2
+    scale = stiffness if tails == 0.0 else stiffness * math.sqrt(tails / (1.0 + square))
+    for k in range(STEP_LENGTH + 1):
+        for j in range(begin, end):
+            rows[k, j] *= scale
+    return square if tails == 0.0 else tails * math.log1p(square)
 
 
 @kernel
 def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """Cost |W (h - b)|^2 of the hull."""
-    rows = _support_rows(terms.hull_directions, terms.hull_support, parameters, rotation)
-    return _add(rows @ terms.hull_root.T, False, sums)
+    rows = _support_rows(terms.hull_directions, terms.hull_support, parameters, rotation) @ terms.hull_root.T
+    add_block(rows, rows.shape[1], sums)
+    square = 0.0
+    for residual in rows[STEP_LENGTH]:
+        square += residual * residual
+    return square
 
 
 @kernel
