@@ -11,6 +11,7 @@
 | crowd | up to twelve superquadrics that touch |
 | carton, stool, shelf board, shelves, tray, bin | things in and on :mod:`sq_perception.simulation.furniture` |
 | nothing | a table and the room behind it, and no thing |
+| label | as table; a band across each thing, or a patch of it, has no reading, as of a dark or shiny label |
 
 A quarter of the images is measured by a sensor of random parameters, the others by one of
 :data:`sq_perception.simulation.sensor_noise.PRESETS`; the depth of a third is bent: off by up to 0.5 % of itself,
@@ -98,6 +99,23 @@ def _tables(low: float, high: float) -> Callable[[np.random.Generator, Camera], 
         return made.depth, made.labels
 
     return drawn
+
+
+def _labelled(rng: np.random.Generator, camera: Camera) -> _Drawn:
+    depth, labels = _tables(20.0, 70.0)(rng, camera)
+    for thing in range(1, int(labels.max()) + 1):
+        cells = np.argwhere(labels == thing)
+        if len(cells) < 20:
+            continue
+        centred = cells - cells.mean(axis=0)
+        across, along = np.linalg.eigh(centred.T @ centred)[1].T
+        way, beside = (along, across) if rng.random() < 0.7 else (across, along)
+        place, extent, width = centred @ way, np.ptp(centred @ way), np.ptp(centred @ beside)
+        hidden = np.abs(place - rng.uniform(-0.25, 0.25) * extent) < rng.uniform(0.05, 0.175) * extent
+        if rng.random() > 0.6:
+            hidden &= np.abs(centred @ beside) < rng.uniform(0.3, 0.5) * width
+        depth[tuple(cells[hidden].T)] = np.inf
+    return depth, labels
 
 
 def _with_room(rng: np.random.Generator, camera: Camera) -> _Drawn:
@@ -226,4 +244,5 @@ KINDS: dict[str, Callable[[np.random.Generator, Camera], _Drawn]] = {
     **{name: _in_furniture(name) for name in furniture.KINDS},
     "nothing": _nothing,
     "near": _heap((0.01, 0.0175), (5, 25), (0.28, 0.45), 35.0),
+    "label": _labelled,
 }
