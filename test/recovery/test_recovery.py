@@ -156,9 +156,9 @@ def test_failed_bodies_are_listed_and_not_rendered(symmetry):
     depth = np.full((240, 320), 1.0, np.float32)
     labels = np.zeros(depth.shape, np.int32)
     labels[100, 100:140] = 1
-    labels[200, 50:61], labels[50, 50] = 2, 3
+    labels[200, 50:61], labels[50:55, 50:52], labels[50, 80] = 2, 3, 4
     found = symmetry.recover(depth, CAMERA, labels)
-    for k, (body, words) in enumerate(zip(found.bodies, ("line", "11 pixels", "1 pixels"), strict=True)):
+    for k, (body, words) in enumerate(zip(found.bodies, ("line", "11 pixels", "10 pixels", "1 pixels"), strict=True)):
         assert (body.label, body.status, body.score) == (k + 1, Status.FAILED, 0)
         assert words in body.message
         assert (body.superquadric.size > 0).all()
