@@ -174,7 +174,8 @@ def _box_of_group(some: np.ndarray) -> State | None:
     if len(group) < MIN_PIXELS:
         return None
     axes = principal_axes(np.cov(group.T))
-    return boxes(*span(group, axes.T, 0.0).T, axes, START_EXPONENT)[-1]
+    low, high = span(group, axes.T, 0.0).T
+    return boxes(low, high, axes, START_EXPONENT)[-1]
 
 
 def _with_probes(cloud: UnitCloud, given: np.ndarray) -> Cloud:

@@ -293,7 +293,7 @@ def _write_areas(depth: np.ndarray, inside: np.ndarray, v: int, footprint: float
 
 def estimate_noise(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
     """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be estimated."""
-    step = max(1, np.count_nonzero(inside) // 2500)  # the median of 5000 third differences is known to 1.5 %
+    step = max(1, int(np.count_nonzero(inside)) // 2500)  # the median of 5000 third differences is known to 1.5 %
     third, first = np.hstack([_differences(depth, inside, step), _differences(depth.T, inside.T, step)])
     if third.size < _FEWEST:
         return DepthNoise(least)

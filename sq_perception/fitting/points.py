@@ -193,7 +193,8 @@ def _starts(cloud: UnitCloud) -> list[State]:
     for some in (few, dense):
         axes = starts.principal_axes(np.cov(some.T))
         for turn in (axes, *starts.eighth_turns(axes)):
-            found += starts.boxes(*span(some, turn.T, 0.05).T, turn, starts.START_EXPONENT)
+            low, high = span(some, turn.T, 0.05).T
+            found += starts.boxes(low, high, turn, starts.START_EXPONENT)
     return found
 
 

@@ -91,7 +91,7 @@ def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
         cost += _weigh(rows, 0, 1, terms.plane_stiffness if is_below else terms.gap_stiffness, 0.0 if is_below else 1.0)
     if terms.rest_stiffness > 0.0:
         n = terms.plane[:3] @ rotation
-        upright = np.argmax(np.abs(n))
+        upright = int(np.argmax(np.abs(n)))
         for j in range(1, 3):
             k, after, before = (upright + j) % 3, (upright + j + 1) % 3, (upright + j + 2) % 3
             rows[8 + before, j], rows[8 + after, j], rows[STEP_LENGTH, j] = n[after], -n[before], n[k]

@@ -67,7 +67,8 @@ def reason_to_fail(points: np.ndarray, count: int, of: str) -> str:
 def principal(points: np.ndarray) -> list[State]:
     """Boxes along the principal axes of the points, for each choice of z."""
     axes = principal_axes(_scatter(points))
-    return boxes(*span(points, axes.T).T, axes)
+    low, high = span(points, axes.T).T
+    return boxes(low, high, axes)
 
 
 def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
@@ -148,7 +149,7 @@ def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray]
     across, between = (points - opposite) / 2, (points + opposite) / 2
     # The centre's depth is the largest mean depth of a pair, but for some in case of stray pixels.
     rank = len(between) - 1 - min(max(4 // stride**2, int(0.002 * len(between))), len(between) - 1)
-    centre = camera.unproject(*middle, np.partition(between[:, 2], rank)[rank])
+    centre = camera.unproject(middle[0], middle[1], np.partition(between[:, 2], rank)[rank])
     chord = centre - between
     weight = np.maximum(chord[:, 2:], observation.footprint / 2)
     moments = ((weight * across).T @ across + (weight * chord).T @ chord / 3) / weight.sum()
