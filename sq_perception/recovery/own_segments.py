@@ -7,7 +7,8 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.netw
               If the mean of p_a over a piece is below ``_SURE``, the network is asked about that piece as if it were a
               segment, and then about pieces that no object claims.  A piece shows another object if it claims itself,
               and if it and the objects found so far do not claim each other: if the means of p are below ``_APART``.
-              A pixel is of the object that claims it most
+              A pixel is of the object that claims it most.  Parts that missing readings keep from touching stay
+              one: lines of sight have joined them
     joined    a and b are one with log odds of k (l_ab + l_ba) + c, by the mean l_ab of the logit of p_a over b; the
               surest pairs first, until none is more likely one than two.  Not where both together are larger than
               ``max_size`` but no larger than the largest thing: in a heap of small things they are two of them
@@ -221,9 +222,21 @@ def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.nda
     more = np.count_nonzero(is_large) - 1
     if more < 1:
         return []
+    owners = logits[is_large].argmax(axis=0)
+    cells = np.full(labels[answer.window].shape, -1, np.int32)
+    cells[rows, columns] = owners
+    if not _touch(cells):
+        return []
     names = np.array([label, *(int(labels.max()) + 1 + np.arange(more))])
-    labels[answer.window][rows, columns] = names[logits[is_large].argmax(axis=0)]
+    labels[answer.window][rows, columns] = names[owners]
     return [int(name) for name in names]
+
+
+def _touch(parts: np.ndarray) -> bool:
+    """Whether any two parts, numbers from 0 in a window, are two pixels apart or less."""
+    near = np.ones((5, 5), np.uint8)
+    owned = [(parts == k).view(np.uint8) for k in range(parts.max() + 1)]
+    return any((cv2.dilate(a, near) & b).any() for k, a in enumerate(owned) for b in owned[:k])
 
 
 def _odds_of_one(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
