@@ -234,12 +234,21 @@ def span(points: np.ndarray, directions: np.ndarray, outliers: float = OUTLIER_S
     return np.asarray(lower + (upper - lower) * (place - before))
 
 
+@kernel
 def draw(pixels: np.ndarray, reach: np.ndarray, count: int, offset: float) -> np.ndarray:
     """All of the pixels (n,), or about ``count``, systematically by their areas, summed up to each in ``reach``."""
-    if len(pixels) <= count:
+    if pixels.shape[0] <= count:
         return pixels
-    chosen = np.searchsorted(reach, (np.arange(count) + offset) * (reach[-1] / count), side="right")
-    return pixels[chosen[np.diff(chosen, append=len(pixels)) > 0]]  # each once
+    chosen, k = np.empty(count, pixels.dtype), 0
+    step = reach[-1] / count
+    ahead = step * offset
+    for i in range(pixels.shape[0]):
+        if reach[i] > ahead and k < count:
+            chosen[k] = pixels[i]
+            k += 1
+            while reach[i] > ahead:
+                ahead += step
+    return chosen[:k]
 
 
 @kernel
