@@ -77,6 +77,9 @@ class Children:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def stop(self) -> None:
         """Interrupt all, wait, and kill those that go on."""
         for child in self._running:
             child.interrupt()
@@ -87,6 +90,7 @@ class Children:
             except subprocess.TimeoutExpired:
                 child.kill()
             child.close()
+        self._running.clear()
 
     def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
         child = Child(node, arguments, self._environment)
