@@ -13,9 +13,9 @@ to it, softly.
 
 A probe is a point known to lie outside, or inside, of the object: d is then held at 0 or above, or at 0 or below.
 
-A cloud is made ready so that its frame, its scale, its order and its density do not matter: coordinates are along its
-principal axes, about its median, in units of its radius (root mean square), and of neighbours in space every so manieth
-stays.
+A cloud is normalised first, so that the result does not depend on its frame, scale, order or density: coordinates are
+along its principal axes, about its median, in units of its root mean square radius; a large cloud is thinned evenly in
+space.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ def from_segment(
     _show(image, depth, labels, label, rows, columns, camera.lens, known, middle, scale)
     # The s, metres, for which the channel of the scale is 0.
     # Largest s, metres, that the network is told: what is larger is known by its shape. An earlier network that was
-    # told all sizes missed 45 %, not 31 %, of 226 household things of three times their size before a simulated D435.
+    # told all sizes missed 45 %, not 31 %, of household things of three times their size before a simulated D435.
     image[..., SCALE] = np.log(min(scale, 0.3) / 0.2)
     image[..., GRAIN] = np.log(length / PIXELS)
     image[..., PLANE] = plane is not None

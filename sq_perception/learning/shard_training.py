@@ -270,9 +270,10 @@ def _mask_batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generato
 
 
 def hide_label(image: np.ndarray, truth: np.ndarray, rng: np.random.Generator) -> None:
-    """Take the readings of a band across a segment, or of a patch of it, from a view (p, p, CHANNELS) and its truth.
+    """Remove the readings of a random band or patch of a segment from a view (p, p, CHANNELS) and its truth, in place.
 
-    A band parts a segment: half of the time what is beyond it becomes another segment, as segmentations make of it.
+    Half of the bands also split the segment: what lies beyond the band becomes another segment, as a segmentation would
+    have it.  Segments of fewer than 30 cells stay as they are.
     """
     cells = np.argwhere((image[..., SEGMENT] > 0) & (image[..., MEASURED] > 0))
     if len(cells) < 30:
